@@ -6,20 +6,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from viability_bounds_pkg.plausible import (
-    CONTRADICTION,
-    GAP,
-    JUMP,
-    NOT_LATER,
-    OUTSIDE,
-    TOO_FAST,
-    WINDOW,
-    PlausibilityCheck,
-)
+from viability_bounds_pkg.plausible import PlausibilityCheck
 from viability_bounds_pkg.state import State
 
-N, LIMIT = 4, np.full(4, 2.5)
-NONE = np.zeros(N)
+N, LIMIT, NONE = 4, np.full(4, 2.5), np.zeros(4)
+WINDOW = 0.2  # s, in which positions and velocities must agree again
+OUTSIDE = "beyond a limit by more than the range of the joint"
+TOO_FAST = "more than 10 times faster than the speed limit"
+JUMP = "a position jumped"
+CONTRADICTION = "positions contradict velocities"
 
 
 def make_check(h=0.002, velocity_error=NONE, limit=LIMIT, position_error=NONE):
@@ -32,8 +27,8 @@ def sine(t, size=0.75, w=2.0):
     return State(size * np.sin(w * t + k), size * w * np.cos(w * t + k))
 
 
-def play(check, spoil, h=0.002, begin=1.0, end=1.6, last=3.0):
-    """Return the times at which states were refused, with the reason.
+def play(check, spoil, h=0.002, end=1.6, last=3.0):
+    """Return the times at which states were refused, with the reason; spoilt from 1 s on.
 
     The arm stops within 0.25 s where states are refused, and goes on when they are accepted.
     """
@@ -41,7 +36,7 @@ def play(check, spoil, h=0.002, begin=1.0, end=1.6, last=3.0):
     for k in range(round(last / h)):
         q, v = sine(along)
         state = State(q, pace * v)
-        if begin <= k * h < end:
+        if 1.0 <= k * h < end:
             state = spoil(state)
         reason = check.fault(state, 5.0 + k * h)
         if reason:
@@ -64,7 +59,6 @@ SPOILT = {
     "far too fast": (lambda state: state._replace(v=1e200 * state.v), TOO_FAST, 0.0),
     "a position leaps": (lambda state: state._replace(q=state.q + 0.4 * JOINT), JUMP, 0.0),
     "a biased velocity": (lambda state: state._replace(v=state.v + JOINT), CONTRADICTION, WINDOW),
-    "zeros": (lambda state: State(0.0 * state.q - 1.0, 0.0 * state.v), JUMP, 0.0),
     "frozen": (lambda state: sine(1.0), CONTRADICTION, 0.06),
     "frozen positions": (lambda state: state._replace(q=sine(1.0).q), CONTRADICTION, 0.06),
     "a frozen position": (frozen_joint, CONTRADICTION, 0.15),
@@ -82,45 +76,44 @@ def test_what_cannot_be_is_refused_and_what_comes_afterwards_is_accepted(name, h
     assert refused[-1][0] <= 1.6 + longest + h
 
 
-@pytest.mark.parametrize("name", ["frozen", "degrees", "zeros"])
+@pytest.mark.parametrize("name", ["frozen", "degrees"])
 def test_what_stays_impossible_stays_refused(name):
     spoil, _, within = SPOILT[name]
-    refused = play(make_check(), spoil, end=6.0, last=6.0)
-    assert len(refused) >= round((5.0 - within) / 0.002) - 1
+    refused = play(make_check(h=0.01), spoil, 0.01, end=6.0, last=6.0)
+    assert len(refused) >= round((5.0 - within) / 0.01) - 1
 
 
 def test_one_impossible_state_costs_no_other():
     check = make_check()
-    wrong = [check.fault(sine(k * 0.002), k * 0.002) for k in range(500)]
+    assert not any(check.fault(sine(k * 0.002), k * 0.002) for k in range(500))
     q, v = sine(1.0)
-    assert not any(wrong) and check.fault(State(q + 0.3, v), 1.0) == JUMP
+    assert check.fault(State(q + 0.3, v), 1.0) == JUMP
     assert check.fault(sine(1.002), 1.002) == ""
 
 
 def test_after_a_gap_in_the_stamps_an_arm_may_be_elsewhere():
     check, elsewhere = make_check(), State(np.full(N, -1.0), NONE)
     assert check.fault(sine(0.0), 1.0) == ""
-    assert check.fault(elsewhere, 1.0 + GAP + 1e-3) == ""
-    assert check.fault(sine(0.0), 1.0) == NOT_LATER
+    assert check.fault(elsewhere, 1.0 + 0.1 + 1e-3) == ""
+    assert check.fault(sine(0.0), 1.0) == "not later than the last one"
     check.reset()
     assert check.fault(sine(0.0), 1.0) == ""
 
 
 def test_velocities_that_are_not_used_are_not_checked():
-    check = make_check(velocity_error=None)
-    rng = np.random.default_rng(0)
-    assert not play(check, lambda state: State(state.q, 1e200 * rng.standard_normal(N)))
+    check, rng = make_check(velocity_error=None), np.random.default_rng(0)
+    assert not play(check, lambda state: State(state.q, 1e200 * rng.standard_normal(N)), last=1.6)
     check.reset()
-    assert play(check, SPOILT["a position leaps"][0])[0][1] == JUMP
+    assert play(check, SPOILT["a position leaps"][0], last=1.1)[0][1] == JUMP
 
 
 def test_joints_without_limits_may_turn_for_ever():
     check = make_check(limit=np.full(N, np.inf))
-    turns = [State(np.full(N, 200.0 + 0.004 * k), np.full(N, 2.0)) for k in range(1000)]
+    turns = [State(np.full(N, 200.0 + 0.004 * k), np.full(N, 2.0)) for k in range(300)]
     assert not any(check.fault(turn, 0.002 * k) for k, turn in enumerate(turns))
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=12, derandomize=True)
 @given(
     h=st.sampled_from([0.001, 0.002, 0.01]),
     lag=st.sampled_from([0.0, 0.001, 0.003]),
@@ -136,14 +129,14 @@ def test_violent_motions_impacts_filters_and_encoders_are_accepted(
     rng = np.random.default_rng(seed)
     check = make_check(h, NONE if used else None, np.full(N, np.inf), np.full(N, 0.5 * resolution))
     (q, v, seen), a = np.zeros((3, N)), np.zeros(N)
-    for k in range(round(1.5 / h)):
+    for k in range(round(1.0 / h)):
         if k % round(0.1 / h) == 0:
             a = rng.uniform(-60.0, 60.0, N)
-        before, (q, v) = v, State(q, v).after(np.clip(a, (-2.0 - v) / h, (2.0 - v) / h), h)
+        q, v = State(q, v).after(np.clip(a, (-2.0 - v) / h, (2.0 - v) / h), h)
         if rng.random() < 0.02:
             hit = rng.uniform(-2.0, 2.0, N) if rng.random() < 0.7 else NONE
             q, v = q + rng.random() * h * (hit - v), hit
         seen = v + np.exp(-h / lag) * (seen - v) if lag else v
         told = resolution * np.round(q / resolution) if resolution else q
         if rng.random() >= lost:
-            assert check.fault(State(told, seen.copy()), 7.0 + k * h) == "", (k, before)
+            assert check.fault(State(told, seen.copy()), 7.0 + k * h) == ""

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Trajectories of the end effector meet their points, smoothly."""
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -11,25 +13,29 @@ from viability_bounds_pkg.pose_trajectory import (
 )
 
 
-def random_points(rng, count=4):
-    points, pose, t = [], pin.SE3.Random(), 0.0
-    for _ in range(count):
+def random_points(seed):
+    pin.seed(seed)
+    rng = np.random.default_rng(seed)
+    points, pose, t = [], pin.SE3.Random(), 0.5
+    for _ in range(5):
         points.append(TrajectoryPoint(t, pose, rng.normal(size=6), rng.normal(size=6)))
         t += rng.uniform(0.3, 1.0)
         pose = pose * pin.exp6(rng.normal(size=6) * 0.5)
     return points
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_points_are_met(seed):
-    pin.seed(seed)
-    points = random_points(np.random.default_rng(seed))
+def distance(one, other):
+    return np.abs(pin.log6(one.actInv(other)).vector).max()
+
+
+def test_points_are_met():
+    points = random_points(0)
     trajectory = PoseTrajectory(points)
-    for k, point in enumerate(points[1:-1], start=1):
+    for point in points[1:-1]:
         for t in (np.nextafter(point.time, 0.0), point.time):
             pose, twist, rate = trajectory.sample(t)
             R = point.pose.rotation
-            assert np.abs(pin.log6(pose.actInv(point.pose)).vector).max() < 1e-9, k
+            assert distance(pose, point.pose) < 1e-9
             np.testing.assert_allclose(twist[:3], R.T @ point.velocity[:3], atol=1e-6)
             np.testing.assert_allclose(twist[3:], R.T @ point.velocity[3:], atol=1e-6)
             np.testing.assert_allclose(rate[3:], R.T @ point.acceleration[3:], atol=1e-4)
@@ -37,13 +43,9 @@ def test_points_are_met(seed):
             np.testing.assert_allclose(classical, R.T @ point.acceleration[:3], atol=1e-4)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_twist_and_its_rate_are_derivatives(seed):
-    pin.seed(seed + 10)
-    rng = np.random.default_rng(seed)
-    trajectory = PoseTrajectory(random_points(rng))
-    h = 1e-5
-    for t in rng.uniform(0.05, trajectory.duration - 0.05, 20):
+def test_twist_and_its_rate_are_derivatives():
+    trajectory, h = PoseTrajectory(random_points(10)), 1e-5
+    for t in np.random.default_rng(0).uniform(0.55, trajectory.duration - 0.05, 40):
         before, now, after = (trajectory.sample(t + k * h) for k in (-1, 0, 1))
         moved = pin.log6(before[0].actInv(after[0])).vector / (2.0 * h)
         np.testing.assert_allclose(now[1], moved, atol=1e-5, rtol=1e-5)
@@ -53,27 +55,34 @@ def test_twist_and_its_rate_are_derivatives(seed):
 
 
 def test_it_rests_before_and_after():
-    pin.seed(1)
-    points = random_points(np.random.default_rng(1))
+    points = random_points(1)
     trajectory = PoseTrajectory(points)
-    for t, point in ((-1.0, points[0]), (1e3, points[-1])):
+    for t, point in ((-1.0, points[0]), (0.4, points[0]), (1e3, points[-1])):
         pose, twist, rate = trajectory.sample(t)
         assert pose == point.pose and not twist.any() and not rate.any()
 
 
+def test_between_points_at_rest_it_turns_about_one_axis():
+    first = pin.SE3(pin.exp3(np.array([0.3, -0.2, 0.9])), np.array([1.0, 0.0, 0.0]))
+    turn, way = np.array([1.0, -2.0, 0.5]), np.array([0.1, 0.2, -0.3])
+    second = pin.SE3(first.rotation @ pin.exp3(turn), first.translation + way)
+    trajectory = PoseTrajectory([TrajectoryPoint(1.0, first), TrajectoryPoint(3.0, second)])
+    # Quintics from rest to rest: 0.5^3 (10 - 15 0.5 + 6 0.5^2) = 0.5 in the middle.
+    for t, share in ((1.0, 0.0), (1.5, 0.103515625), (2.0, 0.5), (3.0, 1.0)):
+        pose = trajectory.sample(t)[0]
+        turned = pin.log3(first.rotation.T @ pose.rotation)
+        np.testing.assert_allclose(turned, share * turn, atol=1e-6)
+        np.testing.assert_allclose(pose.translation - first.translation, share * way, atol=1e-9)
+
+
 # Two axes at right angles, neither along x, y or z.
 E_1, E_2 = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, 1.0])
-
-
-def make(**changes):
-    """Return a circle of 0.2 m radius, and its centre."""
-    pose = pin.SE3(pin.exp3(np.array([0.3, -1.0, 0.5])), np.array([0.4, 0.3, 0.2]))
-    given = {"period": 2.0, "turns": 2.0} | changes
-    return circle(pose, 0.2, (E_1, E_2), **given), pose.translation - 0.2 * E_1
+START = pin.SE3(pin.exp3(np.array([0.3, -1.0, 0.5])), np.array([0.4, 0.3, 0.2]))
 
 
 def test_a_circle_goes_round_from_rest_to_rest():
-    points, centre = make()
+    points = circle(START, 0.2, (E_1, E_2), period=2.0, turns=2.0)
+    centre = START.translation - 0.2 * E_1
     outward = np.array([point.pose.translation for point in points]) - centre
     np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 0.2, rtol=1e-12)
     np.testing.assert_allclose(outward @ np.cross(E_1, E_2), 0.0, atol=1e-15)
@@ -85,58 +94,37 @@ def test_a_circle_goes_round_from_rest_to_rest():
         np.testing.assert_allclose((end.velocity, end.acceleration), 0.0, atol=1e-12)
         np.testing.assert_array_equal(end.pose.rotation, points[1].pose.rotation)
     assert points[-1].time == pytest.approx(4.0)
-    speed = max(np.linalg.norm(point.velocity) for point in points)
-    # The quintic peaks at 15/8 of its mean.
-    assert speed == pytest.approx(0.2 * np.pi * 15.0 / 8.0, rel=1e-2)
 
 
 def test_velocities_and_accelerations_of_a_circle_are_derivatives():
-    points, _ = make(turns=1.0, points_per_turn=10_000)
+    points = circle(START, 0.2, (E_1, E_2), period=2.0, points_per_turn=5000)
     t = np.array([point.time for point in points])
     p = np.array([point.pose.translation for point in points])
     v = np.array([point.velocity[:3] for point in points])
     a = np.array([point.acceleration[:3] for point in points])
-    np.testing.assert_allclose(np.gradient(p, t, axis=0)[1:-1], v[1:-1], atol=1e-6)
-    np.testing.assert_allclose(np.gradient(v, t, axis=0)[1:-1], a[1:-1], atol=1e-5)
+    np.testing.assert_allclose(np.gradient(p, t, axis=0)[1:-1], v[1:-1], atol=4e-6)
+    np.testing.assert_allclose(np.gradient(v, t, axis=0)[1:-1], a[1:-1], atol=4e-5)
     # The few points of a message make the same curve.
-    coarse = PoseTrajectory(make(turns=1.0)[0])
+    coarse = PoseTrajectory(circle(START, 0.2, (E_1, E_2), period=2.0))
     for k in range(0, len(t), 37):
         np.testing.assert_allclose(coarse.sample(t[k])[0].translation, p[k], atol=1e-7)
 
 
-def test_between_points_at_rest_it_turns_about_one_axis():
-    pin.seed(2)
-    for _ in range(20):
-        first, second = pin.SE3.Random(), pin.SE3.Random()
-        whole = pin.log3(first.rotation.T @ second.rotation)
-        if np.linalg.norm(whole) > 3.0:
-            continue
-        trajectory = PoseTrajectory([TrajectoryPoint(1.0, first), TrajectoryPoint(3.0, second)])
-        for t, share in ((0.0, 0.0), (1.0, 0.0), (2.0, 0.5), (3.0, 1.0), (9.0, 1.0)):
-            pose = trajectory.sample(t)[0]
-            turned = pin.log3(first.rotation.T @ pose.rotation)
-            np.testing.assert_allclose(turned, share * whole, atol=1e-6)
-            moved = share * (second.translation - first.translation)
-            np.testing.assert_allclose(pose.translation, first.translation + moved, atol=1e-12)
+HALF_TURN = pin.SE3(pin.utils.rotate("x", np.pi), np.zeros(3))
 
 
 @pytest.mark.parametrize(
-    ("times", "broken", "message"),
+    ("times", "last", "message"),
     [
-        ([], None, "at least one point"),
-        ([0.5, 0.5], None, r"points\[1\].time is 0.5; allowed: more than 0.5"),
-        ([-1.0, 0.0], None, r"points\[0\].time is -1; allowed: at least 0"),
-        ([0.0, 1.0], "velocity", r"points\[1\] is not finite"),
-        ([0.0, 1.0], "turn", r"points\[1\] is turned by 3.14 rad"),
+        ([], {}, "at least one point"),
+        ([0.5, 0.5], {}, r"points\[1\].time is 0.5; allowed: more than 0.5"),
+        ([-1.0, 0.0], {}, r"points\[0\].time is -1; allowed: at least 0"),
+        ([0.0, 1.0], {"velocity": np.full(6, np.nan)}, r"points\[1\] is not finite"),
+        ([0.0, 1.0], {"pose": HALF_TURN}, r"points\[1\] is turned by 3.14 rad"),
     ],
 )
-def test_bad_points(times, broken, message):
-    zero = np.zeros(6)
-    points = [TrajectoryPoint(t, pin.SE3.Identity(), zero, zero) for t in times]
-    if broken == "velocity":
-        points[1] = points[1]._replace(velocity=np.full(6, np.nan))
-    if broken == "turn":
-        half = pin.SE3(pin.utils.rotate("x", np.pi), np.zeros(3))
-        points[1] = points[1]._replace(pose=half)
+def test_points_that_make_no_trajectory_are_refused(times, last, message):
+    points = [TrajectoryPoint(t, pin.SE3.Identity()) for t in times]
+    points[1:] = [point._replace(**last) for point in points[1:]]
     with pytest.raises(TrajectoryError, match=message):
         PoseTrajectory(points)

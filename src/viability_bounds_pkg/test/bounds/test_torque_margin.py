@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Margins for the change of acceleration while a torque is held, against the worst change."""
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,6 @@ from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver
 
 JOINTS = 200
-STEPS = 400
 
 
 def random_case(rng):
@@ -15,16 +16,9 @@ def random_case(rng):
     dt = 10.0 ** rng.uniform(-3.0, -2.0)
     a_min, a_max = -rng.uniform(2.0, 20.0, JOINTS), rng.uniform(2.0, 20.0, JOINTS)
     jerk = rng.uniform(0.0, 0.5, JOINTS) * np.minimum(-a_min, a_max) * 18.0 / dt
-    half = rng.uniform(0.3, 3.0, JOINTS)
-    limits = JointLimits(
-        [f"joint{i}" for i in range(JOINTS)],
-        -half,
-        half,
-        rng.uniform(0.5, 4.0, JOINTS),
-        a_min,
-        a_max,
-    )
-    return limits, dt, jerk
+    half, v_max = rng.uniform(0.3, 3.0, JOINTS), rng.uniform(0.5, 4.0, JOINTS)
+    names = [f"joint{i}" for i in range(JOINTS)]
+    return JointLimits(names, -half, half, v_max, a_min, a_max), dt, jerk
 
 
 def excess_in_units_of_d(rng, limits, dt, jerk, margins, factor):
@@ -36,7 +30,7 @@ def excess_in_units_of_d(rng, limits, dt, jerk, margins, factor):
     q, v = np.zeros(JOINTS), np.zeros(JOINTS)
     target = rng.choice([-1.0, 1.0], JOINTS)
     excess = speed = -np.inf
-    for _ in range(STEPS):
+    for _ in range(400):
         bounds = solver.bounds(q, v)
         # Mostly as fast as allowed towards a limit, now and then the other one.
         target *= np.where(rng.random(JOINTS) < 0.01, -1.0, 1.0)
@@ -54,8 +48,7 @@ def excess_in_units_of_d(rng, limits, dt, jerk, margins, factor):
     return excess, speed
 
 
-@pytest.mark.parametrize("factor", [1.0, 2.0, 3.3])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("seed", "factor"), [(0, 1.0), (1, 2.0), (2, 3.3)])
 def test_margins_keep_the_limits_against_the_worst_deviations(seed, factor):
     rng = np.random.default_rng(seed)
     limits, dt, jerk = random_case(rng)
@@ -69,23 +62,4 @@ def test_without_the_position_margin_the_limits_break():
     limits, dt, jerk = random_case(rng)
     margins = torque_margins(jerk, dt)
     margins.position[:] = 0.0
-    excess, _ = excess_in_units_of_d(rng, limits, dt, jerk, margins, 1.0)
-    assert excess > 1.0
-
-
-def test_margins_shrink_with_the_step():
-    jerk = np.array([100.0, 2000.0])
-    coarse, fine = torque_margins(jerk, 0.01), torque_margins(jerk, 0.001)
-    np.testing.assert_allclose(coarse.acceleration / fine.acceleration, 10.0)
-    np.testing.assert_allclose(coarse.velocity / fine.velocity, 100.0)
-    np.testing.assert_allclose(coarse.position / fine.position, 1000.0)
-
-
-def test_deviations_are_those_of_constant_jerk():
-    J, dt = 300.0, 0.01
-    t = np.linspace(0.0, dt, 10001)
-    velocity = J * (t**2 - t * dt) / 2.0
-    position = J * (t**3 / 6.0 - t**2 * dt / 4.0)
-    E, D = np.array([J]) * dt**2 / 8.0, np.array([J]) * dt**3 / 12.0
-    np.testing.assert_allclose(E[0], np.abs(velocity).max(), rtol=1e-6)
-    np.testing.assert_allclose(D[0], np.abs(position).max(), rtol=1e-6)
+    assert excess_in_units_of_d(rng, limits, dt, jerk, margins, 1.0)[0] > 1.0

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Algorithm 4 and the refined search, against Pinocchio."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -22,7 +20,6 @@ from viability_bounds_pkg.acceleration_limits import (
     EmptyIntervalError,
     estimate_acceleration_limits,
     largest_velocity_scale,
-    limits_from_worst_cases,
     limits_in_share,
     unavailable_share,
 )
@@ -48,7 +45,7 @@ def algorithm_4(model, q, v, tau_max):
 
 
 def test_sampling_is_algorithm_4():
-    model, count = panda(), 3000
+    model, count = panda(), 1000
     q_min, q_max, v_max, tau_max = limits_of(model)
     unit = np.random.default_rng(5).random((count, 14))
     q = q_min + unit[:, :7] * (q_max - q_min)
@@ -60,38 +57,34 @@ def test_sampling_is_algorithm_4():
     assert limits.worst.evaluations == count
 
 
-@pytest.mark.parametrize("method", ["sampling", "refined"])
-def test_worst_states_give_the_limits(method):
+def test_worst_states_give_the_limits():
     model = panda()
     q_min, q_max, v_max, tau_max = limits_of(model)
     worst = estimate_acceleration_limits(
-        model, q_min, q_max, 0.5 * v_max, tau_max, 2000, 1, method=method
+        model, q_min, q_max, 0.5 * v_max, tau_max, 2000, 1, method="refined"
     ).worst
     for j in range(model.nv):
-        for q, v, expected, side in (
-            (worst.q[0, j], worst.v[0, j], worst.a_max[j], 1),
-            (worst.q[1, j], worst.v[1, j], worst.a_min[j], -1),
-        ):
+        for side, expected, limit in ((0, worst.a_max, tau_max), (1, worst.a_min, -tau_max)):
+            q, v = worst.q[side, j], worst.v[side, j]
             assert np.all((q_min <= q) & (q <= q_max))
             assert np.all(np.abs(v) <= 0.5 * v_max)
             a = np.zeros(model.nv)
-            a[j] = expected
+            a[j] = expected[j]
             tau = pin.rnea(model, model.createData(), q, v, a)
-            assert tau[j] == pytest.approx(side * tau_max[j], rel=1e-9)
+            assert tau[j] == pytest.approx(limit[j], rel=1e-9)
 
 
 @pytest.mark.parametrize("method", ["sampling", "refined"])
 def test_pendulum_limits_are_the_analytic_ones(method):
     inertia = PENDULUM_MASS * PENDULUM_LENGTH**2
     weight = PENDULUM_MASS * GRAVITY * PENDULUM_LENGTH
-    model = pendulum()
-    assert np.isinf(model.upperPositionLimit).all()  # so that the angle is drawn from a full turn
     limits = estimate_acceleration_limits(
-        model, [-np.inf], [np.inf], [4.0], [30.0], 4000, 0, method=method
+        pendulum(), [-np.inf], [np.inf], [4.0], [30.0], 4000, 0, method=method
     )
     expected = (30.0 - weight) / inertia
     assert limits.a_max[0] == pytest.approx(expected, rel=1e-5)
     assert limits.a_min[0] == pytest.approx(-expected, rel=1e-5)
+    # A joint without limits turns all the way round.
     assert abs(limits.worst.q[0, 0, 0]) == pytest.approx(math.pi / 2, abs=0.01)
 
 
@@ -115,13 +108,12 @@ def test_two_link_limits_are_the_analytic_ones():
     assert limits.a_min[0] == pytest.approx(-expected, rel=1e-3)  # mirror image
 
 
-@pytest.mark.long
-def test_refined_beats_a_million_samples_with_ten_thousand_evaluations():
+def test_refined_search_beats_twenty_times_as_many_samples():
     model = baxter()
     space = StateSpace.of(model, *limits_of(model))
-    sampled = search_by_sampling(model, space, 1_000_000, 0)
-    refined = search_refined(model, space, 10_000, 0)
-    assert refined.evaluations <= 10_000
+    sampled = search_by_sampling(model, space, 100_000, 0)
+    refined = search_refined(model, space, 5000, 0)
+    assert refined.evaluations <= 5000
     assert np.all(refined.a_max <= sampled.a_max)
     assert np.all(refined.a_min >= sampled.a_min)
     # The gain is not marginal: several limits are a fifth tighter.
@@ -129,64 +121,35 @@ def test_refined_beats_a_million_samples_with_ten_thousand_evaluations():
     assert np.count_nonzero(gain > 0.2) >= 2
 
 
-def test_search_counts_every_evaluation(monkeypatch):
-    calls = 0
-    for name in ("crba", "computeRNEADerivatives"):
-        original = getattr(pin, name)
-
-        def counted(*arguments, original=original):
-            nonlocal calls
-            calls += 1
-            return original(*arguments)
-
-        monkeypatch.setattr(pin, name, counted)
-    model = panda()
-    worst = search_refined(model, StateSpace.of(model, *limits_of(model)), 1000, 0)
-    assert calls == worst.evaluations <= 1000
-
-
-@pytest.mark.parametrize("method", ["sampling", "refined"])
-def test_same_seed_same_limits(method):
-    model = baxter()
+@pytest.mark.parametrize("search", [search_by_sampling, search_refined])
+def test_same_seed_same_limits(search):
+    model = pendulum(links=2, joint_type="revolute")
     space = StateSpace.of(model, *limits_of(model))
-    search = {"sampling": search_by_sampling, "refined": search_refined}[method]
-    first = search(model, space, 3000, 7)
-    again = search(model, space, 3000, 7)
-    other = search(model, space, 3000, 8)
+    first, again, other = (search(model, space, 200, seed) for seed in (7, 7, 8))
     np.testing.assert_array_equal(first.a_max, again.a_max)
     np.testing.assert_array_equal(first.q, again.q)
-    assert np.any(first.a_max != other.a_max)
-
-
-def test_shorter_run_is_the_start_of_a_longer_one():
-    model = baxter()
-    space = StateSpace.of(model, *limits_of(model))
-    short = search_by_sampling(model, space, 64, 3)
-    long = search_by_sampling(model, space, 300, 3)
-    assert (long.a_max <= short.a_max).all() and (long.a_max < short.a_max).any()
-    assert (long.a_max == short.a_max).any()
+    assert np.any(first.q != other.q)
 
 
 def test_caps_and_overrides():
     model = baxter()
-    limits = limits_of(model)
-    arguments = {"samples": 2000, "seed": 0, "overrides": {"left_s1": (-3.0, 2.0)}}
-    plain = estimate_acceleration_limits(model, *limits, **arguments)
+    arguments = {"samples": 1000, "overrides": {"left_s1": (-3.0, 2.0)}}
+    plain = estimate_acceleration_limits(model, *limits_of(model), **arguments)
     assert (plain.a_min[1], plain.a_max[1]) == (-3.0, 2.0)
     assert plain.overridden == {"left_s1"}
-    capped = estimate_acceleration_limits(model, *limits, **arguments, cap=15.0)
-    assert capped.a_max[6] == 15.0 and capped.a_min[6] == -15.0
+    capped = estimate_acceleration_limits(model, *limits_of(model), **arguments, cap=15.0)
+    assert (capped.a_min[6], capped.a_max[6]) == (-15.0, 15.0)
     assert capped.a_max[0] == plain.a_max[0] < 15.0
     assert (capped.a_min[1], capped.a_max[1]) == (-3.0, 2.0)
 
 
-@pytest.mark.parametrize("share", [0.3, 0.8])
-def test_limits_of_a_share_are_available_in_as_many_other_states(share):
+def test_limits_of_a_share_are_available_in_as_many_other_states():
     """By Algorithm 4's lines for single states, which are others than those used."""
-    model = baxter()
+    model, share = baxter(), 0.8
     q_min, q_max, v_max, tau_max = limits_of(model)
-    found = limits_in_share(model, StateSpace.of(model, q_min, q_max, v_max, tau_max), share)
-    rng, count = np.random.default_rng(3), 3000
+    space = StateSpace.of(model, q_min, q_max, v_max, tau_max)
+    found = limits_in_share(model, space, share)
+    rng, count = np.random.default_rng(3), 2000
     available = np.zeros(model.nv)
     for _ in range(count):
         q, v = rng.uniform(q_min, q_max), rng.uniform(-v_max, v_max)
@@ -195,65 +158,32 @@ def test_limits_of_a_share_are_available_in_as_many_other_states(share):
     np.testing.assert_allclose(available / count, share, atol=0.03)
 
 
-def test_gravity_beyond_the_torque_is_named():
-    model = baxter()
-    with pytest.raises(EmptyIntervalError) as raised:
-        estimate_acceleration_limits(model, *limits_of(model), 20_000, 0)
-    error = raised.value
-    assert (error.joint, error.scale) == ("left_s1", 0.0)
-    found = largest_velocity_scale(model, StateSpace.of(model, *limits_of(model)))
-    assert found.joint == "left_s1"
-    static = pin.computeGeneralizedGravity(model, model.createData(), found.q)
-    assert abs(static[1]) > 50.0
-    assert f"takes {abs(static[1]):.3g} N m just to hold still" in str(error)
-    assert "left_s1" in str(error) and "50 N m" in str(error) and "\n" not in str(error)
-    assert "lower velocities do not help" in str(error)
-
-
-def test_too_much_speed_is_told_with_the_scale_that_helps():
-    model = panda()
-    limits = limits_of(model)
-    with pytest.raises(EmptyIntervalError) as raised:
-        estimate_acceleration_limits(model, *limits, 10_000, 0, method="refined")
-    error = raised.value
-    assert error.joint == "panda_joint2"
-    scale = error.scale
-    assert 0.8 < scale < 0.95
-    assert f"{scale:.3f}" in str(error)
-
-    def least_room(factor):
-        slower = (*limits[:2], factor * limits[2], limits[3])
-        worst = search_refined(model, StateSpace.of(model, *slower), 10_000, 11)
-        return min(worst.a_max.min(), -worst.a_min.max())
-
-    # The scale leaves 1 rad/s^2 either way, and hardly any more.
-    assert least_room(scale) == pytest.approx(1.0, abs=0.1)
-    assert least_room(1.1 * scale) < 0.2
-
-
-def test_velocity_scale_of_a_pendulum_in_closed_form():
-    """At the tip of a two-link arm only the Coriolis torque grows with speed."""
-    model = pendulum(links=2, joint_type="revolute")
-    space = StateSpace.of(model, [-3, -3], [3, 3], [8.0, 8.0], [60.0, 30.0])
-    found = largest_velocity_scale(model, space, 1.0)
-    assert 0.0 < found.scale < 1.0
-    assert found.joint == "joint1" or found.joint == "joint2"
-    h = pin.nonLinearEffects(model, model.createData(), found.q, found.v)
-    inertia = pin.crba(model, model.createData(), found.q).diagonal()
-    room = (space.tau_max - np.abs(h)) / inertia
-    assert room.min() == pytest.approx(1.0, abs=0.01)
-    stronger = StateSpace.of(model, [-3, -3], [3, 3], [8.0, 8.0], [600.0, 300.0])
-    assert largest_velocity_scale(model, stronger, 1.0).scale == 1.0
-
-
-def test_unavailable_share_counts_states():
+def test_an_override_is_reported_with_the_share_of_states_that_do_not_allow_it():
     model = baxter()
     space = StateSpace.of(model, *limits_of(model))
-    worst = search_refined(model, space, 5000, 0)
-    limits = limits_from_worst_cases(model, space, worst, {"left_s1": (-3.0, 3.0)})
+    overrides = {"left_s1": (-3.0, 3.0)}
+    limits = estimate_acceleration_limits(
+        model, *limits_of(model), 5000, method="refined", overrides=overrides
+    )
     share = unavailable_share(model, space, limits)
     assert 0.15 < share[1] < 0.25
     np.testing.assert_array_equal(np.delete(share, 1), 0.0)
+
+
+def test_gravity_beyond_the_torque_is_named():
+    """What too much speed gives, see `test_estimate_executable`."""
+    with pytest.raises(EmptyIntervalError) as raised:
+        estimate_acceleration_limits(pendulum(), [-3], [3], [4.0], [5.0], 500)
+    assert (raised.value.joint, raised.value.scale) == ("joint1", 0.0)
+    assert "lower velocities do not help" in str(raised.value)
+    assert "takes 9.81 N m just to hold still" in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_with_torque_enough_velocities_need_not_be_scaled():
+    model = pendulum(links=2, joint_type="revolute")
+    space = StateSpace.of(model, [-3, -3], [3, 3], [8.0, 8.0], [600.0, 300.0])
+    assert largest_velocity_scale(model, space).scale == 1.0
 
 
 @pytest.mark.parametrize(
@@ -265,14 +195,13 @@ def test_unavailable_share_counts_states():
         ({"v_max": np.zeros(7)}, "joint left_s0: v_max must be positive"),
         ({"tau_max": np.full(7, np.nan)}, "joint left_s0: tau_max must be positive"),
         ({"samples": 0}, "samples must be at least 1, is 0"),
-        ({"samples": 0, "method": "refined"}, "samples must be at least 1, is 0"),
         ({"method": "guess"}, "method must be one of sampling, refined"),
         ({"overrides": {"elbow": (-1, 1)}}, "unknown joint 'elbow'"),
         ({"overrides": {"left_s0": (1, 2)}}, "joint left_s0: override"),
         ({"cap": 0.0}, "cap must be positive"),
     ],
 )
-def test_bad_arguments(change, message):
+def test_bad_arguments_are_refused(change, message):
     model = baxter()
     keys = ("q_min", "q_max", "v_max", "tau_max")
     arguments = dict(zip(keys, limits_of(model), strict=True)) | {"samples": 10, "seed": 0}
@@ -280,8 +209,6 @@ def test_bad_arguments(change, message):
         estimate_acceleration_limits(model, **arguments | change)
 
 
-@pytest.mark.parametrize("count", [4, 400])
-def test_joint_that_moves_nothing_is_named(count):
-    model = pendulum(tip_mass=0.0)
+def test_a_joint_that_moves_nothing_is_named():
     with pytest.raises(LimitEstimateError, match="joint joint1 moves no inertia"):
-        estimate_acceleration_limits(model, [-1], [1], [1], [1], count, 0)
+        estimate_acceleration_limits(pendulum(tip_mass=0.0), [-1], [1], [1], [1], 10)

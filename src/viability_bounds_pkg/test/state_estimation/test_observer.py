@@ -1,26 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Observers against disturbances that do their worst, and against other gains."""
+
 import numpy as np
 import pytest
 
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.state_estimation.observer import SLACK, Observer, design_observer
+from viability_bounds_pkg.state_estimation.observer import Observer, design_observer
 
 CASES = [
     # dt, largest error of position and acceleration
     (0.001, 5e-5, 2.0),
-    (0.002, 5e-5, 5.0),
     (0.01, 5e-4, 1.0),
-    (0.001, 1e-4, 60.0),
     (0.002, 1e-6, 40.0),
     (0.002, 0.0, 3.0),
 ]
-STEPS = 2500
+STEPS = 1500
 
 
 def observer_at(design, dt, state, lasting=0.0):
     observer = Observer(design, dt, np.full(len(state.q), lasting))
     observer.start(state)
     return observer
+
+
+def track(observer, a, q):
+    """Advance by a period to a measured position; return the innovation."""
+    observer.predict(a)
+    innovation = observer.innovation(q)
+    observer.correct(innovation)
+    return innovation
 
 
 def responses(design, dt):
@@ -57,85 +65,74 @@ def test_bang_bang_disturbances_reach_the_guaranteed_errors(dt, delta, w):
 
 
 @pytest.mark.parametrize("target", [0, 1])
-@pytest.mark.parametrize(("dt", "delta", "w"), CASES)
+@pytest.mark.parametrize(("dt", "delta", "w"), CASES[:2])
 def test_an_adversary_comes_near_the_guaranteed_errors_but_not_beyond(dt, delta, w, target):
     # Played forward: the signs of the responses in the order of time, d constant in each step.
     design = design_observer(dt, [delta], [w])
     noise, pulses, _ = responses(design, dt)
-    count = 1500
-    n = delta * np.sign(noise[:count, target])[::-1]
-    d = w * np.sign(pulses[:count].mean(axis=1)[:, target])[::-1]
-    observer = observer_at(design, dt, State(np.zeros(1), np.zeros(1)))
+    n = delta * np.sign(noise[:, target])[::-1]
+    d = w * np.sign(pulses.mean(axis=1)[:, target])[::-1]
     truth = State(np.zeros(1), np.zeros(1))
-    guaranteed = design.position_error[0], design.velocity_error[0]
-    for k in range(count):
+    observer = observer_at(design, dt, truth)
+    guaranteed = np.array([design.position_error[0], design.velocity_error[0]])
+    for k in range(STEPS):
         truth = truth.after(d[k : k + 1], dt)
-        observer.predict(np.zeros(1))
-        innovation = observer.innovation(truth.q + n[k])
+        innovation = track(observer, np.zeros(1), truth.q + n[k])
         assert abs(innovation[0]) <= design.innovation[0] * (1.0 + 1e-9) + 1e-15
-        observer.correct(innovation)
-        errors = [abs(a - b)[0] for a, b in zip(truth, observer.state, strict=True)]
-        assert errors[0] <= guaranteed[0] * (1.0 + 1e-9) + 1e-12
-        assert errors[1] <= guaranteed[1] * (1.0 + 1e-9) + 1e-12
+        errors = np.abs(np.subtract(truth, observer.state))[:, 0]
+        assert (errors <= guaranteed * (1.0 + 1e-9) + 1e-12).all()
     # d may change its sign within a step, too, which this adversary does not.
     assert errors[target] >= 0.9 * guaranteed[target]
 
 
-def test_guarantees_hold_under_quantisation_noise_and_changing_accelerations():
+@pytest.mark.parametrize("lasting", [0.0, 4.0])
+def test_guarantees_hold_under_quantisation_and_while_disturbances_are_learned(lasting):
     rng = np.random.default_rng(1)
-    dt, resolution, w = 0.001, 1e-4, 4.0
-    design = design_observer(dt, np.full(50, 0.5 * resolution), np.full(50, w))
-    start = State(rng.uniform(-1, 1, 50), np.zeros(50))
-    observer, truth = observer_at(design, dt, start), start
-    largest = np.zeros(50)
-    for k in range(4000):
-        d = w * np.sign(np.sin(rng.uniform(2.0, 60.0) * k * dt + np.arange(50)))
-        known = 10.0 * np.sin(0.01 * k + np.arange(50))
+    dt, resolution, w, count = 0.001, 1e-4, 4.0, 50
+    design = design_observer(dt, np.full(count, 0.5 * resolution), np.full(count, w + lasting))
+    truth = State(rng.uniform(-1, 1, count), np.zeros(count))
+    observer = observer_at(design, dt, truth, lasting)
+    largest = np.zeros(count)
+    for k in range(3000):
+        if k % 300 == 0:  # the worst is a change of sign after the other one was learned
+            d = w * rng.choice([-1.0, 1.0], count)
+        known = 10.0 * np.sin(0.01 * k + np.arange(count))
         truth = truth.after(known + d, dt)
-        observer.predict(known)
-        observer.correct(observer.innovation(resolution * np.rint(truth.q / resolution)))
-        np.maximum(largest, abs(truth.v - observer.state.v), out=largest)
+        innovation = track(observer, known, resolution * np.rint(truth.q / resolution))
+        assert (abs(innovation) <= design.innovation).all()
         assert (abs(truth.q - observer.state.q) <= design.position_error).all()
+        np.maximum(largest, abs(truth.v - observer.state.v), out=largest)
     assert (largest <= design.velocity_error).all()
     assert (largest > 0.2 * design.velocity_error).any(), "far from what is guaranteed"
 
 
-@pytest.mark.parametrize(("dt", "delta", "w"), CASES[:4])
-def test_no_other_gains_are_much_better(dt, delta, w):
-    def worst(l1, l2):
-        """Return the largest error of the velocity with any gains, infinite if unstable."""
-        A = np.array([[1.0 - l1, (1.0 - l1) * dt], [-l2, 1.0 - l2 * dt]])
-        if np.abs(np.linalg.eigvals(A)).max() > 0.995:
-            return np.inf
-        noise, step = np.array([l1, l2]), np.array([(1.0 - l1) * 0.5 * dt, 1.0 - 0.5 * l2 * dt])
-        total = 0.0
-        for _ in range(1500):
-            total += delta * abs(noise[1]) + w * dt * abs(step[1])
-            noise, step = A @ noise, A @ step
-        return total
+def worst_velocity_errors(dt, delta, w, poles):
+    """Return the largest errors of the velocity that gains for pairs of poles leave."""
+    l1, l2 = 1.0 - (poles[0] * poles[1]).real, ((1.0 - poles[0]) * (1.0 - poles[1])).real / dt
+    A = np.moveaxis(np.array([[1.0 - l1, (1.0 - l1) * dt], [-l2, 1.0 - l2 * dt]]), 2, 0)
+    noise = np.stack([l1, l2], axis=1)[..., None]
+    step = np.stack([(1.0 - l1) * 0.5 * dt, 1.0 - 0.5 * l2 * dt], axis=1)[..., None]
+    total = 0.0
+    for _ in range(STEPS):
+        total = total + delta * np.abs(noise[:, 1, 0]) + w * dt * np.abs(step[:, 1, 0])
+        noise, step = A @ noise, A @ step
+    return total
 
+
+@pytest.mark.parametrize(("dt", "delta", "w"), CASES[:3])
+def test_no_other_gains_are_much_better(dt, delta, w):
+    """The observer may be 15 % worse than the best, for less noise."""
     design = design_observer(dt, [delta], [w])
     p = 1.0 - np.sqrt(design.velocity_gain[0] * dt)
-    frequencies = -np.log(p) / dt * np.geomspace(0.25, 4.0, 13)
-    same_poles = min(worst(1.0 - z**2, (1.0 - z) ** 2 / dt) for z in np.exp(-frequencies * dt))
-    # Complex and real pairs of poles around it, too.
-    best = min(
-        worst(1.0 - (z1 * z2).real, ((1.0 - z1) * (1.0 - z2)).real / dt)
-        for w0 in frequencies
-        for damping in (0.4, 0.6, 0.8, 1.2, 1.8, 3.0)
-        for z1, z2 in [
-            np.exp(w0 * dt * np.roots([1.0, 2.0 * damping, 1.0]))  # roots of s^2 + 2 d s + 1
-        ]
-    )
+    frequencies = -np.log(p) * np.geomspace(0.25, 4.0, 13)
+    equal = np.exp(-frequencies)
+    # Complex and real pairs: roots of s^2 + 2 d s + 1.
+    roots = np.array([np.roots([1.0, 2.0 * d, 1.0]) for d in (0.4, 0.6, 0.8, 1.2, 1.8, 3.0)])
+    pairs = np.exp(frequencies[:, None] * roots.T[:, None, :]).reshape(2, -1)
+    pairs = pairs[:, np.abs(pairs).max(axis=0) < 0.995]
     ours = design.velocity_error[0]
-    assert ours <= 1.01 * SLACK * same_poles
-    assert ours <= 1.15 * SLACK * best
-
-
-def test_larger_errors_of_the_position_make_slower_observers():
-    design = design_observer(0.001, [1e-6, 1e-5, 1e-4, 1e-3], np.full(4, 3.0))
-    assert (np.diff(design.velocity_gain) < 0.0).all()
-    assert (np.diff(design.velocity_error) > 0.0).all()
+    assert ours <= 1.01 * 1.15 * worst_velocity_errors(dt, delta, w, (equal, equal)).min()
+    assert ours <= 1.15 * 1.15 * worst_velocity_errors(dt, delta, w, pairs).min()
 
 
 def test_exact_positions_give_an_observer_that_is_right_after_two_periods():
@@ -147,8 +144,7 @@ def test_exact_positions_give_an_observer_that_is_right_after_two_periods():
     truth = State(np.array([1.0]), np.array([0.5]))
     for _ in range(2):
         truth = truth.after(np.ones(1), dt)
-        observer.predict(np.ones(1))
-        observer.correct(observer.innovation(truth.q))
+        track(observer, np.ones(1), truth.q)
     np.testing.assert_allclose(observer.state, truth, atol=1e-12)
 
 
@@ -158,59 +154,26 @@ def test_nothing_declared_guarantees_that_there_is_no_error():
         np.testing.assert_array_equal(each, np.zeros(3))
 
 
-def test_an_error_at_the_start_decays_where_accelerations_are_declared_exact():
+def test_an_error_at_the_start_decays_whatever_is_declared():
+    """While disturbances are learned, and where accelerations are declared exact."""
+    design = design_observer(0.001, [0.0, 1e-7, 1e-3, 1e-3], [3.0, 3.0, 3.0, 0.0])
+    observer = observer_at(design, 0.001, State(np.full(4, 1e-3), np.ones(4)), 1e9)
+    for _ in range(15000):
+        track(observer, np.zeros(4), np.zeros(4))
+    assert np.abs(observer.state.v).max() < 1e-6
+    assert np.abs(observer.disturbance).max() < 1e-3
+
+
+@pytest.mark.parametrize(("lasting", "left"), [(0.0, 1.0), (2.0, 1.0 / 3.0), (3.0, 0.0)])
+def test_a_lasting_disturbance_is_learned_up_to_what_is_declared(lasting, left):
     dt = 0.001
-    design = design_observer(dt, [1e-3], [0.0])
-    observer = observer_at(design, dt, State(np.zeros(1), np.ones(1)))
-    for _ in range(2000):
-        observer.predict(np.zeros(1))
-        observer.correct(observer.innovation(np.zeros(1)))
-    assert abs(observer.state.v[0]) < 1e-6
-
-
-def test_a_lasting_disturbance_is_learned_up_to_what_is_declared():
-    dt = 0.001
-    for lasting, left in ((0.0, 1.0), (2.0, 1.0 / 3.0), (3.0, 0.0)):
-        design = design_observer(dt, [5e-5], [3.0 + lasting])
-        observer = observer_at(design, dt, State(np.zeros(1), np.zeros(1)), lasting)
-        truth = observer.state
-        for _ in range(3000):
-            truth = truth.after(np.full(1, 3.0), dt)
-            observer.predict(np.zeros(1))
-            observer.correct(observer.innovation(truth.q))
-        assert observer.disturbance[0] == pytest.approx(min(lasting, 3.0), rel=1e-3)
-        lag = 2.0 / ((1.0 - np.sqrt(1.0 - design.position_gain[0])) / dt) - 1.5 * dt
-        expected = left * 3.0 * lag  # what is not learned makes the velocity late
-        assert truth.v[0] - observer.state.v[0] == pytest.approx(expected, rel=1e-2, abs=1e-5)
-
-
-def test_the_guarantee_holds_while_disturbances_are_learned():
-    rng = np.random.default_rng(6)
-    dt, resolution, w = 0.001, 1e-4, 4.0
-    design = design_observer(dt, np.full(30, 0.5 * resolution), np.full(30, 2.0 * w))
-    observer = observer_at(design, dt, State(np.zeros(30), np.zeros(30)), w)
-    truth = observer.state
-    largest = np.zeros(30)
-    for k in range(6000):
-        if k % 300 == 0:  # the worst is a change of sign after the other one was learned
-            d = w * rng.choice([-1.0, 1.0], 30)
-        truth = truth.after(d, dt)
-        observer.predict(np.zeros(30))
-        innovation = observer.innovation(resolution * np.rint(truth.q / resolution))
-        assert (abs(innovation) <= design.innovation).all()
-        observer.correct(innovation)
-        np.maximum(largest, abs(truth.v - observer.state.v), out=largest)
-        assert (abs(truth.q - observer.state.q) <= design.position_error).all()
-    assert (largest <= design.velocity_error).all()
-    assert (largest > 0.5 * design.velocity_error).any()
-
-
-@pytest.mark.parametrize("delta", [0.0, 1e-7, 1e-5, 1e-3])
-def test_learning_is_stable_for_any_poles(delta):
-    design = design_observer(0.001, [delta], [3.0])
-    observer = observer_at(design, 0.001, State(np.full(1, 1e-3), np.ones(1)), 1e9)
-    for _ in range(30000):
-        observer.predict(np.zeros(1))
-        observer.correct(observer.innovation(np.zeros(1)))
-    assert abs(observer.state.v[0]) < 1e-6
-    assert abs(observer.disturbance[0]) < 1e-3
+    design = design_observer(dt, [5e-5], [3.0 + lasting])
+    truth = State(np.zeros(1), np.zeros(1))
+    observer = observer_at(design, dt, truth, lasting)
+    for _ in range(3000):
+        truth = truth.after(np.full(1, 3.0), dt)
+        track(observer, np.zeros(1), truth.q)
+    assert observer.disturbance[0] == pytest.approx(lasting, rel=1e-3)
+    lag = 2.0 / ((1.0 - np.sqrt(1.0 - design.position_gain[0])) / dt) - 1.5 * dt
+    expected = left * 3.0 * lag  # what is not learned makes the velocity late
+    assert truth.v[0] - observer.state.v[0] == pytest.approx(expected, rel=1e-2, abs=1e-5)

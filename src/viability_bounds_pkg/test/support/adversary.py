@@ -11,8 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from joint_cases import column, position_window
 
-from viability_bounds_pkg.viability import BoundsSolver
-
 VIOLATION = 1e-9
 """Largest violation of a limit in continuous time, rad and rad/s."""
 
@@ -29,29 +27,36 @@ def advance(q, v, a, dt):
     return q_next, v + dt * a, low, high
 
 
-def towards_nearest(q, v, lower, upper, limits, rng):
-    """Rush at the limit that is closer: the greedy adversary."""
-    return np.where(limits.q_max - q < q - limits.q_min, upper, lower)
+def choose(q, v, lower, upper, limits, rng):
+    """Return accelerations within the bounds; one motion after the other chooses differently."""
+    nearer_above = limits.q_max - q < q - limits.q_min
+    ways = [
+        upper,
+        lower,
+        np.where(v > 0.0, upper, lower),
+        np.where(nearer_above, upper, lower),
+        np.where(rng.random(q.shape) < 0.5, lower, upper),
+        rng.uniform(lower, upper),
+    ]
+    return np.choose(np.arange(len(q))[:, None] % len(ways), ways)
 
 
-POLICIES = {
-    "upper": lambda q, v, lower, upper, limits, rng: upper,
-    "lower": lambda q, v, lower, upper, limits, rng: lower,
-    "random": lambda q, v, lower, upper, limits, rng: rng.uniform(lower, upper),
-    "either": lambda q, v, lower, upper, limits, rng: np.where(
-        rng.random(q.shape) < 0.5, lower, upper
-    ),
-    "faster": lambda q, v, lower, upper, limits, rng: np.where(v > 0.0, upper, lower),
-    "nearest": towards_nearest,
-}
+def stray(v, w, rng):
+    """Return errors of the acceleration up to w; six motions stray alike, the next six otherwise.
+
+    So they meet all ways to `choose`.
+    """
+    ways = [w + 0.0 * v, -w + 0.0 * v, w * np.sign(v), w * rng.choice([-1.0, 1.0], v.shape)]
+    return np.choose(np.arange(len(v))[:, None] // 6 % len(ways), ways)
 
 
 class Violations:
-    """Largest violations of the position and speed limits seen, rad and rad/s."""
+    """Largest violations of the limits seen, rad and rad/s; states lost from the kernel."""
 
     def __init__(self, limits):
         self.limits = limits
         self.position = self.speed = -np.inf
+        self.lost = 0
 
     def see(self, low, high, v):
         position = np.maximum(high - self.limits.q_max, self.limits.q_min - low)
@@ -90,59 +95,53 @@ def states_outside(solver, case, count, rng):
     reach = min(0.3 * (high - low), 0.5 * min(-a_min, a_max) * span**2)
     excess = min(v_max, min(-a_min, a_max) * span)
     fastest = min(v_max, (high - low) / dt)
-    q = rng.uniform(low - reach, high + reach, 4 * count)
-    v = rng.uniform(-fastest - excess, fastest + excess, 4 * count)
-    outside = ~solver.bounds(column(q), column(v)).viable[:, 0]
-    return column(q[outside][:count]), column(v[outside][:count])
+    q = column(rng.uniform(low - reach, high + reach, 4 * count))
+    v = column(rng.uniform(-fastest - excess, fastest + excess, 4 * count))
+    outside = ~solver.bounds(q, v).viable[:, 0]
+    assert outside.sum() >= count
+    return q[outside][:count], v[outside][:count]
 
 
-class Kept(NamedTuple):
-    """How motions from within the kernel went.
+def drive(solver, q, v, steps, rng, time=None, w=0.0):
+    """Let joints that are in the kernel choose among the bounds; return what was violated.
 
-    Attributes:
-        joint_steps: their number.
-        lost: states that were not in the kernel any more.
-        position: largest violation of a position limit in continuous time, rad; negative if none.
-        speed: largest violation of a speed limit, rad/s.
+    Args:
+        solver: the bounds.
+        q, v: states to start from.
+        steps: their number.
+        rng: random generator.
+        time: returns how long each step takes, s; as long as the bounds are for, if not given.
+        w: by how much accelerations differ from those chosen, changing within a step, rad/s^2.
     """
-
-    joint_steps: int
-    lost: int
-    position: float
-    speed: float
-
-
-def drive(solver: BoundsSolver, q, v, policy: str, steps: int, rng) -> Kept:
-    """Let joints that are in the kernel choose among the bounds for a number of steps."""
-    limits, seen, lost = solver.limits, Violations(solver.limits), 0
+    seen = Violations(solver.limits)
     for _ in range(steps):
         lower, upper, viable = solver.bounds(q, v)
-        lost += int((~viable).sum())
-        a = POLICIES[policy](q, v, lower, upper, limits, rng)
-        q, v, low, high = advance(q, v, a, solver.steps)
-        seen.see(low, high, v)
-    return Kept(steps * q.size, lost, float(seen.position), float(seen.speed))
+        seen.lost += int((~viable).sum())
+        a = choose(q, v, lower, upper, solver.limits, rng)
+        duration = solver.steps if time is None else time()
+        for part in (0.4, 0.1, 0.5) if w else (1.0,):
+            q, v, low, high = advance(q, v, a + stray(v, w, rng), part * duration)
+            seen.see(low, high, v)
+    return seen
 
 
 class Returned(NamedTuple):
     """How motions from outside the kernel went.
 
     Attributes:
-        joint_steps: their number.
         stray: joints that did not get back.
         again: largest violation of a limit by a joint that had been back, rad and rad/s.
         position: the furthest that any went beyond where braking at its limit takes it, rad.
         speed: the most that any was faster than at the start or than its limit, rad/s.
     """
 
-    joint_steps: int
     stray: int
     again: float
     position: float
     speed: float
 
 
-def bring_back(solver: BoundsSolver, q, v, policy: str, most_steps: int, rng) -> Returned:
+def bring_back(solver, q, v, most_steps, rng):
     """Let joints that are outside the kernel choose among the bounds until all are in it."""
     limits = solver.limits
     # The way that braking at its limit takes, from each state.
@@ -153,18 +152,16 @@ def bring_back(solver: BoundsSolver, q, v, policy: str, most_steps: int, rng) ->
     fastest = np.maximum(limits.v_max, np.abs(v))
     back = np.zeros(q.shape, dtype=bool)
     position = speed = again = -np.inf
-    steps = 0
-    while True:
+    for _ in range(most_steps):
         lower, upper, viable = solver.bounds(q, v)
         back |= viable
-        if back.all() or steps == most_steps:
+        if back.all():
             break
-        a = POLICIES[policy](q, v, lower, upper, limits, rng)
+        a = choose(q, v, lower, upper, limits, rng)
         q, v, low, high = advance(q, v, a, solver.steps)
-        position = max(position, float(np.maximum(high - stop_above, stop_below - low).max()))
-        speed = max(speed, float((np.abs(v) - fastest).max()))
+        position = max(position, np.maximum(high - stop_above, stop_below - low).max())
+        speed = max(speed, (np.abs(v) - fastest).max())
         outside = np.maximum(high - limits.q_max, limits.q_min - low)
         outside = np.maximum(outside, np.abs(v) - limits.v_max)
-        again = max(again, float(outside.max(where=back, initial=-np.inf)))
-        steps += 1
-    return Returned(steps * q.size, int((~back).sum()), again, position, speed)
+        again = max(again, outside.max(where=back, initial=-np.inf))
+    return Returned(int((~back).sum()), again, position, speed)

@@ -2,81 +2,92 @@
 """Problem (4) of [DelPrete2018] solved as it is stated, to check the closed forms against.
 
 Nothing here comes from Algorithms 1 to 3 or from `docs/theory/bounds.md`: no stopping distance, no
-kernel, no case distinction. A motion is N steps of constant acceleration, eq. (5). Everything is
-linear in the accelerations, so that "maximise a_0 subject to the limits" is a linear program
-with a constraint for each of infinitely many times. It is solved by exchange: keep the limits at
-some times, find where the resulting parabolas leave the range (their extrema), add those times,
-repeat. The horizon is bracketed: a motion that need not be continued after N steps gives at
-least the true bound (outer), one that must end at rest, where it can stay, at most (inner).
+kernel, no case distinction. A motion is N steps of constant acceleration, eq. (5), and ends at
+rest, where it can stay. Everything is linear in the accelerations, so that "maximise a_0 subject
+to the limits" is a linear program with a constraint for each of infinitely many times. It is
+solved by exchange: keep the limits at some times, find where the resulting parabolas leave the
+range (their extrema), add those times, repeat.
 
 Lengths are made dimensionless with the step and a typical acceleration; the solver's feasibility
-tolerance is 1e-10 of that.
+tolerance is 1e-10 of that. Motions from several states are solved side by side, which is faster.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from joint_cases import one_joint
 from scipy.optimize import linprog
 from scipy.sparse import coo_matrix
 
-TOLERANCE = 1e-10
-VIABLE = 1e-8
-"""A state counts as viable if limits that are wider by this much can be kept."""
+from viability_bounds_pkg.viability import acceleration_bounds
 
-ROUNDS = 400
-FIRST_PHASES = np.array([0.5, 1.0])
+EXACT = 1e-6
+"""Largest error of a bound, as a part of the acceleration range."""
 
+EDGE = 1e-6
+"""Margin within which viable states are not told from others."""
 
-@dataclass(frozen=True)
-class BruteForceJoint:
-    """Limits of one joint and the step, SI units."""
-
-    q_min: float
-    q_max: float
-    v_max: float
-    a_min: float
-    a_max: float
-    dt: float
+TOLERANCE, VIABLE, ROUNDS = 1e-10, 1e-8, 400
 
 
-@dataclass(frozen=True)
-class Extremes:
-    """Smallest and largest first acceleration, shape (m,), rad/s^2; nan where not viable.
+class Comparison(NamedTuple):
+    """The closed form beside brute force.
 
-    `margin` is how much narrower, or if negative wider, limits the state could keep, in units of
-    a dt^2 for positions and a dt for speeds, where a is the larger of the acceleration limits.
-    It is 1 at most, and only a bound on itself where it is below zero. Where the solver fails,
-    which at such tolerances it does now and then, the result is nan.
+    Attributes:
+        compared: states that are viable, and whose bounds were therefore compared.
+        misjudged: those further than `EDGE` from the kernel's edge that we call viable and
+            brute force does not, or the other way round.
+        unsafe: those of them that we call viable and brute force does not.
+        undecided: those for which the solver of linear programs gave up.
+        difference: largest difference of a bound, as a part of the acceleration range.
+        excess: the same of bounds that allow more than brute force does.
     """
 
-    lower: np.ndarray
-    upper: np.ndarray
-    margin: np.ndarray
+    compared: int
+    misjudged: int
+    unsafe: int
+    undecided: int
+    difference: float
+    excess: float
 
 
-def extreme_accelerations(
-    joint: BruteForceJoint, q: np.ndarray, v: np.ndarray, steps: int, end_at_rest: bool
-) -> Extremes:
-    """Solve problem (4) on a finite horizon for m states, side by side.
+def compare(case, q, v, bounds=acceleration_bounds) -> Comparison:
+    """Compare viability and bounds with problem (4), for columns of states."""
+    *limits, dt = case
+    lower, upper, viable = (part[:, 0] for part in bounds(q, v, one_joint(*limits), dt))
+    least, most, margin = extreme_accelerations(case, q[:, 0], v[:, 0])
+    clear, found = np.abs(margin) > EDGE, np.isfinite(least) & np.isfinite(most)
+    wrong = clear & (viable != (margin >= 0.0))
+    both = viable & found
+    more = np.concatenate([(upper - most)[both], (least - lower)[both]]) / (case[4] - case[3])
+    return Comparison(
+        compared=both.sum(),
+        misjudged=wrong.sum(),
+        unsafe=(wrong & viable).sum(),
+        undecided=(np.isnan(margin) | (clear & viable & ~found)).sum(),
+        difference=np.abs(more).max(initial=-np.inf),
+        excess=more.max(initial=-np.inf),
+    )
 
-    Args:
-        joint: its limits.
-        q: shape (m,), rad.
-        v: shape (m,), rad/s.
-        steps: horizon N.
-        end_at_rest: True for the inner bracket, False for the outer one.
+
+def extreme_accelerations(case, q, v):
+    """Return smallest and largest first acceleration of m states, and their margin.
+
+    The margin is how much narrower, or if negative wider, limits the state could keep, in units
+    of a dt^2 for positions and a dt for speeds, where a is the larger of the acceleration limits.
+    It is 1 at most, and only a bound on itself where it is below zero. Accelerations are nan where
+    the state is not viable; all is nan where the solver fails, which it does now and then.
     """
-    motions = _Motions(joint, q, v, steps, end_at_rest)
+    motions = _Motions(case, q, v)
     # The speed the state starts with is not the program's to choose.
     margin = np.minimum(motions.margin(), motions.v_max - np.abs(motions.v))
     viable = margin >= -VIABLE
-    lower, upper = np.full(len(q), np.nan), np.full(len(q), np.nan)
-    for out, sign in ((upper, 1.0), (lower, -1.0)):
-        motions = _Motions(joint, q[viable], v[viable], steps, end_at_rest)
-        out[viable] = motions.extreme(sign)
-    return Extremes(lower, upper, margin)
+    least, most = np.full(len(q), np.nan), np.full(len(q), np.nan)
+    least[viable] = _Motions(case, q[viable], v[viable]).extreme(-1.0)
+    most[viable] = _Motions(case, q[viable], v[viable]).extreme(1.0)
+    return least, most, margin
 
 
 class _Motions:
@@ -89,24 +100,21 @@ class _Motions:
     motion need not touch.
     """
 
-    def __init__(self, joint, q, v, steps, end_at_rest):
-        self.unit = max(-joint.a_min, joint.a_max)
-        scale = self.unit * joint.dt**2
-        self.m, self.steps, self.end_at_rest = len(q), steps, end_at_rest
-        self.low, self.high = joint.q_min / scale, joint.q_max / scale
-        self.v_max = joint.v_max * joint.dt / scale
-        self.bounds = np.array([joint.a_min, joint.a_max]) / self.unit
-        self.q, self.v = np.asarray(q) / scale, np.asarray(v) * joint.dt / scale
-        grid = np.meshgrid(np.arange(self.m), np.arange(steps), FIRST_PHASES, indexing="ij")
-        self.cuts = [part.ravel() for part in grid]
+    def __init__(self, case, q, v):
+        q_min, q_max, v_max, a_min, a_max, dt = case
+        self.unit = max(-a_min, a_max)
+        scale = self.unit * dt**2
+        self.m = len(q)
+        self.steps = 8 + int(np.ceil(v_max / (min(-a_min, a_max) * dt)))
+        self.low, self.high, self.v_max = q_min / scale, q_max / scale, v_max * dt / scale
+        self.bounds = np.array([a_min, a_max]) / self.unit
+        self.q, self.v = q / scale, v * dt / scale
+        grid = np.meshgrid(np.arange(self.m), np.arange(self.steps), [0.5, 1.0], indexing="ij")
+        self.cuts = [part.ravel() for part in grid]  # motion, step, part of the step
 
-    def margin(self) -> np.ndarray:
-        """Return the margin that can be kept for ever; negative if the limits cannot.
-
-        Below -`VIABLE` it is only a bound on itself: it is not followed further.
-        """
-        margin = np.full(self.m, np.nan)
-        active = np.arange(self.m)
+    def margin(self):
+        """Return the margin that can be kept for ever; negative if the limits cannot."""
+        margin, active = np.full(self.m, np.nan), np.arange(self.m)
         for _ in range(ROUNDS):
             x = self._solve(active, "margin")
             margin[active] = x[:, self.steps]
@@ -118,14 +126,13 @@ class _Motions:
         margin[active] = np.nan
         return margin
 
-    def extreme(self, sign: float) -> np.ndarray:
+    def extreme(self, sign):
         """Return the largest (or, with sign -1, the smallest) first acceleration, rad/s^2."""
-        extreme = np.full(self.m, np.nan)
-        active = np.arange(self.m)
+        extreme, active = np.full(self.m, np.nan), np.arange(self.m)
         for _ in range(ROUNDS):
             first = self._solve(active, "first", sign)[:, 0]
             active, first = active[np.isfinite(first)], first[np.isfinite(first)]
-            x = self._solve(active, "margin", sign, first)
+            x = self._solve(active, "clear", sign, first)
             finished = self._add_cuts(x, active)
             extreme[active] = np.where(finished & np.isfinite(x[:, 0]), first, np.nan)
             active = active[~finished]
@@ -133,7 +140,7 @@ class _Motions:
                 break
         return extreme * self.unit
 
-    def _solve(self, active, goal, sign=1.0, first=None) -> np.ndarray:
+    def _solve(self, active, goal, sign=1.0, first=None):
         """Return the best variables of the active motions, shape (k, 2 N + 1)."""
         if active.size == 0:
             return np.empty((0, 2 * self.steps + 1))
@@ -142,7 +149,7 @@ class _Motions:
         bounds[:, : self.steps] = self.bounds
         if goal == "first":
             cost[:, 0] = -sign
-        elif first is None:
+        elif goal == "margin":
             cost[:, self.steps] = -1.0
             bounds[:, self.steps] = (-np.inf, 1.0)
         else:
@@ -150,21 +157,21 @@ class _Motions:
             cost[:, self.steps + 1 :] = -1.0
             bounds[:, self.steps + 1 :] = (-1e-9, 1.0)
         matrix, rhs = self._rows(active)
-        equality = self._rest(active) if self.end_at_rest else (None, None)
-        options = {
-            "primal_feasibility_tolerance": TOLERANCE,
-            "dual_feasibility_tolerance": TOLERANCE,
-        }
+        at_rest = np.zeros(cost.shape)
+        at_rest[:, : self.steps] = 1.0
+        tight = dict.fromkeys(
+            ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), 1e-10
+        )
         for attempt in ({}, {"presolve": False}):
             result = linprog(
                 cost.ravel(),
                 A_ub=matrix,
                 b_ub=rhs,
-                A_eq=equality[0],
-                b_eq=equality[1],
+                A_eq=self._sparse(at_rest, active, active),
+                b_eq=-self.v[active],
                 bounds=bounds.reshape(-1, 2),
                 method="highs",
-                options={**options, **attempt},
+                options={**tight, **attempt},
             )
             if result.status == 0:
                 return result.x.reshape(cost.shape)
@@ -172,20 +179,18 @@ class _Motions:
             return np.full(cost.shape, np.nan)
         # At such tolerances the solver gives up now and then: find the motion it is about.
         halves = np.array_split(np.arange(active.size), 2)
-        return np.concatenate(
-            [
-                self._solve(active[half], goal, sign, None if first is None else first[half])
-                for half in halves
-            ]
-        )
+        parts = [
+            self._solve(active[half], goal, sign, None if first is None else first[half])
+            for half in halves
+        ]
+        return np.concatenate(parts)
 
-    def _add_cuts(self, x: np.ndarray, active: np.ndarray) -> np.ndarray:
+    def _add_cuts(self, x, active):
         """Add the times at which motions leave the range; return which of them do not."""
         a = x[:, : self.steps]
         slack = -np.minimum(x[:, self.steps : self.steps + 1] + x[:, self.steps + 1 :], 0.0)
         v_start = self.v[active, None] + np.cumsum(a, axis=1) - a
-        q_end = self.q[active, None] + np.cumsum(v_start + 0.5 * a, axis=1)
-        q_start = q_end - v_start - 0.5 * a
+        q_start = self.q[active, None] + np.cumsum(v_start + 0.5 * a, axis=1) - v_start - 0.5 * a
         with np.errstate(divide="ignore", invalid="ignore"):
             phase = np.where(a != 0.0, -v_start / a, -1.0)
         inside = (phase > 0.0) & (phase < 1.0)
@@ -199,7 +204,7 @@ class _Motions:
         finished[motion] = False
         return finished
 
-    def _rows(self, active: np.ndarray):
+    def _rows(self, active):
         """Return position limits at the cuts, and speed limits, of motions as ``A x <= b``."""
         kept = np.isin(self.cuts[0], active)
         motion, step, phase = (part[kept] for part in self.cuts)
@@ -223,13 +228,7 @@ class _Motions:
         margins = np.hstack([np.ones((len(at), 1)), at[:, None] == j])
         return self._sparse(np.hstack([weights, margins]), owners, active), rhs
 
-    def _rest(self, active: np.ndarray):
-        """Return "the speed after the last step is zero"."""
-        sums = np.zeros((active.size, 2 * self.steps + 1))
-        sums[:, : self.steps] = 1.0
-        return self._sparse(sums, active, active), -self.v[active]
-
-    def _sparse(self, weights: np.ndarray, owners: np.ndarray, active: np.ndarray):
+    def _sparse(self, weights, owners, active):
         row, column = np.nonzero(weights)
         width = 2 * self.steps + 1
         place = np.searchsorted(active, owners)[row] * width + column

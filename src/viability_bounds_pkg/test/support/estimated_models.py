@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 from viability_bounds_pkg.robot.description import build_model, read_urdf
 
 ROBOTS = "package://example-robot-data/robots"
 PENDULUM_MASS, PENDULUM_LENGTH, GRAVITY = 2.0, 0.5, 9.81
 
 
+@cache
 def baxter():
     joints = [f"left_{name}" for name in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
     return build_model(read_urdf(f"{ROBOTS}/baxter_description/urdf/baxter.urdf"), joints)
 
 
+@cache
 def panda():
     joints = [f"panda_joint{i}" for i in range(1, 8)]
     return build_model(read_urdf(f"{ROBOTS}/panda_description/urdf/panda.urdf"), joints)
@@ -29,7 +33,7 @@ def limits_of(model):
     )
 
 
-def pendulum_urdf(*, joint_type="continuous", tip_mass=PENDULUM_MASS, links=1):
+def pendulum(links=1, joint_type="continuous", tip_mass=PENDULUM_MASS):
     """Point masses on massless rods that swing about y; angles zero hang straight down."""
     parts = ['<robot name="pendulum"><link name="link0"/>']
     for i in range(1, links + 1):
@@ -41,9 +45,5 @@ def pendulum_urdf(*, joint_type="continuous", tip_mass=PENDULUM_MASS, links=1):
             f'<mass value="{tip_mass}"/>'
             '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>'
         )
-    return "".join(parts) + "</robot>"
-
-
-def pendulum(**kwargs):
-    links = kwargs.get("links", 1)
-    return build_model(pendulum_urdf(**kwargs), [f"joint{i}" for i in range(1, links + 1)])
+    joints = [f"joint{i}" for i in range(1, links + 1)]
+    return build_model("".join(parts) + "</robot>", joints)

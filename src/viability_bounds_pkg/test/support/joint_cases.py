@@ -6,32 +6,26 @@ import numpy as np
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.viability import BoundsSolver
 
-Case = tuple[float, float, float, float, float, float]
-"""q_min, q_max, v_max, a_min, a_max, dt."""
-
+# q_min, q_max, v_max, a_min, a_max, dt
 HOLDING = {
     "figure 3": (-0.5, 0.5, 2.0, -10.0, 10.0, 0.1),
     "asymmetric": (-0.4, 0.8, 2.0, -6.0, 14.0, 0.1),
-    "asymmetric, mirrored": (-0.8, 0.4, 2.0, -14.0, 6.0, 0.1),
     "condition (11) just holds": (-0.05, 0.05, 1.0, -10.0, 10.0, 0.1),
     "no lower limit": (-np.inf, 0.5, 2.0, -10.0, 7.0, 0.1),
     "continuous": (-np.inf, np.inf, 2.0, -10.0, 7.0, 0.5),
 }
 FAILING = {
-    "too fast": (-0.5, 0.5, 0.6, -10.0, 6.0, 0.1),
-    "too fast, one limit": (-np.inf, 0.5, 0.4, -10.0, 6.0, 0.1),
-    "narrow": (-0.03, 0.03, 2.0, -10.0, 10.0, 0.1),
-    "narrow and asymmetric": (-0.06, 0.06, 2.0, -10.0, 4.0, 0.1),
+    "too fast": (-np.inf, 0.5, 0.4, -10.0, 6.0, 0.1),
+    "narrow": (-0.06, 0.06, 2.0, -10.0, 4.0, 0.1),
     "weak one way": (-0.2, 0.3, 3.0, -10.0, 1.0, 0.1),
     "narrow and too fast": (-0.02, 0.02, 0.6, -10.0, 10.0, 0.1),
     "far too narrow": (-0.002, 0.002, 2.0, -10.0, 8.0, 0.1),
     "hardly affected": (-0.028, 0.338, 3.7, -6.165, 2.874, 0.4385),
 }
 CASES = {**HOLDING, **FAILING}
-FAST_LOOP = {"1 kHz": (-0.5, 0.5, 2.0, -12.0, 9.0, 0.001)}
-"""Too many steps to a stop for a brute-force solution."""
 
 ODD_STEPS = {
+    "1 kHz": (-0.5, 0.5, 2.0, -12.0, 9.0, 0.001),
     "tiny step": (-0.5, 0.5, 2.0, -12.0, 9.0, 1e-5),
     "huge step": (-0.5, 0.5, 2.0, -12.0, 9.0, 10.0),
 }
@@ -41,17 +35,26 @@ def one_joint(q_min, q_max, v_max, a_min, a_max):
     return JointLimits(["joint"], [q_min], [q_max], [v_max], [a_min], [a_max])
 
 
-def discrete_time_condition(limits, dt, margin=None, **errors):
-    """Return whether condition (11) holds for all joints with all of their braking."""
+def solver_of(case, margin=0.0, period=1.0, **errors):
+    """Return the bounds of a joint.
+
+    Args:
+        case: limits and step.
+        margin: share of the weaker acceleration limit.
+        period: share of the step.
+        errors: of position and velocity, as `BoundsSolver` takes them.
+    """
+    *limits, dt = case
+    w = margin * min(-case[3], case[4])
+    return BoundsSolver(one_joint(*limits), dt, [w], period * dt, **errors)
+
+
+def condition_holds(limits, dt, margin=None, **errors):
+    """Return whether condition (11) holds for a joint with all of its braking."""
     try:
         return bool(BoundsSolver(limits, dt, margin, **errors).exact.all())
     except JointLimitsError:
         return False
-
-
-def condition_holds(case):
-    """Return whether condition (11) holds for a joint."""
-    return discrete_time_condition(one_joint(*case[:5]), case[5])
 
 
 def column(values):
@@ -61,31 +64,17 @@ def column(values):
 def random_joint(rng, holds):
     """Return limits and step of a random joint for which condition (11) holds, or fails.
 
-    One in four lacks a limit or both, and speed, braking and range are such that it stops within
-    some dozen steps.
+    Speed, braking and range are such that it stops within some dozen steps.
     """
     while True:
         dt = 10.0 ** rng.uniform(-3.0, 0.0)
         a_min, a_max = -rng.uniform(2.0, 20.0), rng.uniform(2.0, 20.0)
         unit = max(-a_min, a_max) * dt
-        v_max = unit * rng.uniform(0.3, 3.0)
         length = unit * dt * 10.0 ** rng.uniform(-1.5, 1.5)
         q_min = rng.uniform(-1.0, 1.0) * length
-        q_max = q_min + length
-        missing = rng.integers(0, 20)
-        if missing in (0, 1, 2):
-            q_min = -np.inf
-        if missing in (2, 3, 4):
-            q_max = np.inf
-        case = (q_min, q_max, v_max, a_min, a_max, dt)
-        if condition_holds(case) == holds:
+        case = (q_min, q_min + length, unit * rng.uniform(0.3, 3.0), a_min, a_max, dt)
+        if condition_holds(one_joint(*case[:5]), dt) == holds:
             return case
-
-
-def horizon(case):
-    """Return the number of steps within which a motion of a joint is decided."""
-    _, _, v_max, a_min, a_max, dt = case
-    return 8 + int(np.ceil(v_max / (min(-a_min, a_max) * dt)))
 
 
 def position_window(case):
@@ -98,7 +87,7 @@ def position_window(case):
 
 
 def states_of(case, count, seed):
-    """Return random positions and velocities, some on the limits, many of them viable."""
+    """Return columns of random positions and velocities, some on the limits, many viable."""
     _, _, v_max, _, _, dt = case
     rng = np.random.default_rng(seed)
     low, high = position_window(case)
@@ -107,6 +96,5 @@ def states_of(case, count, seed):
     q, v = rng.uniform(low, high, count), rng.uniform(-fastest, fastest, count)
     kind = rng.integers(0, 20, count)
     q[kind == 0], q[kind == 1] = low, high
-    v[kind == 2], v[kind == 3] = fastest, -fastest
-    v[kind == 4] = 0.0
-    return q, v
+    v[kind == 2], v[kind == 3], v[kind == 4] = fastest, -fastest, 0.0
+    return column(q), column(v)

@@ -9,35 +9,15 @@ and return conflicting or huge bounds, or a nan, elsewhere. What differs from th
 - the branch ``v >= 0`` of Algorithm 1 is ``v > 0``, as eq. (17) has it; at rest on a limit the
   print would compute 0 / 0.
 
-States have shape (n,) or (batch, n), rad and rad/s; bounds are in rad/s^2.
+Arguments are those of `viability.acceleration_bounds`; bounds are (lower, upper), not ordered and
+not clipped, of the shape of the state, rad/s^2.
 """
 
-from __future__ import annotations
-
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from viability_bounds_pkg.joint_limits import JointLimits
-
-Array = NDArray[np.float64]
 
 
-class Interval(NamedTuple):
-    """Bounds on the acceleration, of the shape of the state, rad/s^2; not ordered, not clipped."""
-
-    lower: Array
-    upper: Array
-
-
-CONSTRAINTS = ("position", "velocity", "viability", "acceleration")
-"""What `active_upper_bounds` counts, in the order of Algorithm 3."""
-
-
-def position_bounds(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float) -> Interval:
+def position_bounds(q, v, limits, dt):
     """Return the bounds that keep the position limits during the step: Algorithm 1."""
-    q, v = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         a1 = -v / dt
         a2_upper = -v * v / (2.0 * (limits.q_max - q))
@@ -46,23 +26,15 @@ def position_bounds(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float) 
     a3_lower = 2.0 * (limits.q_min - q - dt * v) / dt**2
     stops_above = (v > 0.0) & (a3_upper <= a1)
     stops_below = (v < 0.0) & (a3_lower >= a1)
-    return Interval(
+    return (
         np.where(stops_below, np.maximum(a1, a2_lower), a3_lower),
         np.where(stops_above, np.minimum(a1, a2_upper), a3_upper),
     )
 
 
-def velocity_bounds(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float) -> Interval:
-    """Return the bounds that keep the velocity limits at the end of the step: eq. (23)."""
-    v = np.asarray(v, dtype=np.float64)
-    return Interval((-limits.v_max - v) / dt, (limits.v_max - v) / dt)
-
-
-def viability_bounds(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float) -> Interval:
+def viability_bounds(q, v, limits, dt):
     """Return the bounds that lead into the kernel of eq. (10): Algorithm 2."""
-    q, v = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
-    a1 = -v / dt
-    a = dt**2
+    a1, a = -v / dt, dt**2
     braking = -limits.a_min
     b = dt * (2.0 * v + braking * dt)
     c = v * v - 2.0 * braking * (limits.q_max - q - dt * v)
@@ -75,31 +47,31 @@ def viability_bounds(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float)
     delta = b * b - 4.0 * a * c
     root = (-b - np.sqrt(np.maximum(delta, 0.0))) / (2.0 * a)
     lower = np.where(delta >= 0.0, np.minimum(a1, root), a1)
-    return Interval(lower, upper)
+    return lower, upper
 
 
-def combined_bounds(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float) -> Interval:
-    """Return the tightest of all bounds: Algorithm 3."""
-    lower, upper = _stacked(q, v, limits, dt)
-    return Interval(lower.max(axis=0), upper.min(axis=0))
-
-
-def active_upper_bounds(
-    q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float
-) -> NDArray[np.intp]:
-    """Return which of `CONSTRAINTS` gives the upper bound, of the shape of the state: Fig. 3."""
-    return _stacked(q, v, limits, dt).upper.argmin(axis=0)
-
-
-def _stacked(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float) -> Interval:
-    position = position_bounds(q, v, limits, dt)
+def _all_bounds(q, v, limits, dt):
+    """Return lower and upper bounds, in the order of Algorithm 3."""
+    q, v = np.broadcast_arrays(np.asarray(q, dtype=float), np.asarray(v, dtype=float))
+    constant = np.ones_like(v)
     rows = [
-        position,
-        velocity_bounds(q, v, limits, dt),
+        position_bounds(q, v, limits, dt),
+        ((-limits.v_max - v) / dt, (limits.v_max - v) / dt),  # eq. (23)
         viability_bounds(q, v, limits, dt),
-        Interval(
-            np.broadcast_to(limits.a_min, position.lower.shape),
-            np.broadcast_to(limits.a_max, position.upper.shape),
-        ),
+        (limits.a_min * constant, limits.a_max * constant),
     ]
-    return Interval(np.stack([r.lower for r in rows]), np.stack([r.upper for r in rows]))
+    return np.stack([row[0] for row in rows]), np.stack([row[1] for row in rows])
+
+
+def combined_bounds(q, v, limits, dt):
+    """Return the tightest of all bounds: Algorithm 3."""
+    lower, upper = _all_bounds(q, v, limits, dt)
+    return lower.max(axis=0), upper.min(axis=0)
+
+
+def active_upper_bounds(q, v, limits, dt):
+    """Return what gives the upper bound: Fig. 3.
+
+    0 is position, 1 velocity, 2 viability, 3 acceleration.
+    """
+    return _all_bounds(q, v, limits, dt)[1].argmin(axis=0)

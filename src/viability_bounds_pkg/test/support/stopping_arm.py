@@ -6,11 +6,13 @@ import pinocchio as pin
 
 from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.stop import MARGIN, CoordinatedStop
+from viability_bounds_pkg.stop import CoordinatedStop
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 from viability_bounds_pkg.viability import BoundsSolver
 
 H = 1e-3  # s
+FEW_STEPS = 6 * H
+W = 0.05  # largest error of accelerations, in the limits, docs/theory/whole_arm.md
 
 
 class Arm:
@@ -24,7 +26,7 @@ class Arm:
         keys = (*keys, "acceleration_min", "acceleration_max")
         self.limits = JointLimits(values["joints"], *(np.array(values[key]) for key in keys))
         self.tau_max = np.array(values["torque_max"])
-        self.margin = MARGIN * np.minimum(-self.limits.a_min, self.limits.a_max)
+        self.margin = W * np.minimum(-self.limits.a_min, self.limits.a_max)
         self.n = len(self.limits)
         self.solver = BoundsSolver(self.limits, H, self.margin)
 
@@ -46,21 +48,22 @@ class Arm:
         middle = 0.5 * (self.limits.q_min + self.limits.q_max)
         return middle, rng.uniform(-0.1, 0.1, self.n) * self.limits.v_max
 
-    def move(self, q, v, tau, parts=2):
+    def move(self, q, v, tau):
         """The state after a step under a held torque, by the classical Runge-Kutta method."""
-        h = H / parts
 
         def slope(q, v):
             return v, pin.aba(self.model, self.data, q, v, tau).copy()
 
-        for _ in range(parts):
-            k1 = slope(q, v)
-            k2 = slope(q + 0.5 * h * k1[0], v + 0.5 * h * k1[1])
-            k3 = slope(q + 0.5 * h * k2[0], v + 0.5 * h * k2[1])
-            k4 = slope(q + h * k3[0], v + h * k3[1])
-            q = q + h / 6.0 * (k1[0] + 2.0 * (k2[0] + k3[0]) + k4[0])
-            v = v + h / 6.0 * (k1[1] + 2.0 * (k2[1] + k3[1]) + k4[1])
-        return q, v
+        k1 = slope(q, v)
+        k2 = slope(q + 0.5 * H * k1[0], v + 0.5 * H * k1[1])
+        k3 = slope(q + 0.5 * H * k2[0], v + 0.5 * H * k2[1])
+        k4 = slope(q + H * k3[0], v + H * k3[1])
+        q = q + H / 6.0 * (k1[0] + 2.0 * (k2[0] + k3[0]) + k4[0])
+        return q, v + H / 6.0 * (k1[1] + 2.0 * (k2[1] + k3[1]) + k4[1])
+
+    def braking(self, v):
+        """The hardest braking within the acceleration limits."""
+        return np.where(v > 0.0, -self.limits.a_min, self.limits.a_max)
 
     def beyond(self, q):
         return np.maximum(np.maximum(q - self.limits.q_max, self.limits.q_min - q), 0.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm whose motion is integrated in small steps, and what coarse hardware makes of it."""
+"""An arm under held commands whose motion is integrated in small steps."""
 
 from __future__ import annotations
 
@@ -15,27 +15,17 @@ from viability_bounds_pkg.testing.ros_harness import read_config
 
 
 @cache
-def model(robot: str = "panda") -> pin.Model:
-    """Return the model of a shipped robot."""
-    given = read_config(robot)
-    locked = dict(
-        zip(given.get("locked_joints", ()), given.get("locked_positions", ()), strict=True)
-    )
-    return build_model(
-        read_urdf(given["robot_description"]), given["joints"], locked, given.get("rotor_inertia")
-    )
-
-
-SUBSTEP = 2.5e-4
-"""Of the integration, s: off by less than 1e-6 rad and rad/s, also for a step of 20 N m through a
-lag of 1.6 ms."""
+def model() -> pin.Model:
+    """Return the model of Panda."""
+    given = read_config("panda")
+    urdf = read_urdf(given["robot_description"])
+    return build_model(urdf, given["joints"], None, given.get("rotor_inertia"))
 
 
 class TrueArm:
     """An arm under held commands, its motors with a first-order lag or without.
 
     Args:
-        model: n joints.
         dt: control period, s.
         state: at the beginning.
         tau: torque of the motors then, shape (n,), N m.
@@ -43,10 +33,9 @@ class TrueArm:
         disturbance: acceleration that the model does not know, from the time, s.
     """
 
-    def __init__(self, model, dt, state, tau, lag=None, disturbance=None) -> None:
-        self.model, self.data, self.dt = model, model.createData(), dt
-        self.state, self.tau = state, tau
-        self.lag = lag
+    def __init__(self, dt, state, tau, lag=None, disturbance=None) -> None:
+        self.data, self.dt = model().createData(), dt
+        self.state, self.tau, self.lag = state, tau, lag
         self.disturbance = disturbance or (lambda t: 0.0)
         self.t = 0.0
 
@@ -58,18 +47,23 @@ class TrueArm:
 
     def acceleration(self):
         """Return the present acceleration without what the model does not know."""
-        return np.array(pin.aba(self.model, self.data, *self.state, self.tau))
+        return np.array(pin.aba(model(), self.data, *self.state, self.tau))
+
+    def met(self):
+        """Return the state that a command meets: with a lag, that of the double integrator."""
+        if self.lag is None:
+            return self.state
+        (q, v), a = self.state, self.acceleration() + self.disturbance(self.t)
+        return State(q + self.lag * v, v + self.lag * a)
 
     def step(self, command) -> None:
-        """Move for a period."""
+        """Move for a period, by Runge and Kutta in steps of 0.25 ms."""
 
         def acceleration(t, q, v):
             tau = self.torque(command, t)
-            return pin.aba(self.model, self.data, q, v, tau) + self.disturbance(self.t + t)
+            return pin.aba(model(), self.data, q, v, tau) + self.disturbance(self.t + t)
 
-        # By Runge and Kutta. Where a disturbance switches within a step the arm feels a mean of
-        # it, which is no larger.
-        (q, v), count = self.state, math.ceil(self.dt / SUBSTEP - 1e-9)
+        (q, v), count = self.state, math.ceil(self.dt / 2.5e-4 - 1e-9)
         h = self.dt / count
         for t in (h * np.arange(count)).tolist():
             k1 = acceleration(t, q, v)
