@@ -132,26 +132,22 @@ def test_motors_with_a_lag_pass_no_limit_where_the_law_knows_it(talos, told):
         assert np.abs(v).max() < 5e-3
 
 
-def test_the_observer_balances_what_the_model_does_not_know(panda):
-    rng = np.random.default_rng(2)
+@pytest.mark.parametrize("options", [{"observer_time": 0.002}, {}])
+def test_only_with_the_observer_it_rests_under_torques_that_the_model_does_not_know(
+    panda, options
+):
+    rng, stop = np.random.default_rng(2), panda.stop(**options)
     unknown = 0.1 * panda.tau_max * rng.uniform(-1.0, 1.0, panda.n)
-    start = panda.inside(rng)
-
-    def drift(**options):
-        """Return how far the arm goes from where it came to rest, rad, and how fast it is."""
-        stop, (q, v) = panda.stop(**options), start
-        stop.start(q, v)
-        place = q
-        for _ in range(600):
-            q, v = panda.move(q, v, stop.torque(q, v) + unknown)
-            place = place if stop.at_rest else q
-        assert stop.at_rest
-        return np.abs(q - place).max(), np.abs(v).max()
-
-    observed, speed = drift(observer_time=0.002)
-    assert observed < 3e-4
-    assert speed < 1e-6
-    assert drift()[0] > 10.0 * observed
+    q, v = panda.inside(rng)
+    stop.start(q, v)
+    place = q
+    for _ in range(600):
+        q, v = panda.move(q, v, stop.torque(q, v) + unknown)
+        place = place if stop.at_rest else q
+    assert stop.at_rest == bool(options)
+    if options:
+        assert np.abs(q - place).max() < 3e-4
+        assert np.abs(v).max() < 1e-6
 
 
 def test_at_rest_it_holds_its_place_and_gives_way_to_a_long_push(panda):
