@@ -115,34 +115,10 @@ def test_every_module_of_the_maths_can_be_imported(environment):
     assert ended.returncode == 0, ended.stderr
 
 
-def test_types_are_shipped(environment):
-    for package in OWN:
-        assert list(environment.glob(f"lib/*/site-packages/{package}/py.typed"))
-
-
 @pytest.mark.parametrize("example", ["bounds_alone", "controller_without_ros"])
 def test_examples_of_the_maths(environment, example):
     ended = in_environment(environment, "python", ROOT / "examples" / f"{example}.py")
     assert ended.returncode == 0, ended.stdout + ended.stderr
-
-
-def test_the_estimator_as_a_command(environment, tmp_path):
-    urdf = tmp_path / "swing.urdf"
-    urdf.write_text(
-        '<robot name="swing"><link name="base"/><joint name="swing" type="revolute">'
-        '<parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>'
-        '<limit lower="-2" upper="2" effort="30" velocity="4"/></joint>'
-        '<link name="rod"><inertial><origin xyz="0 0 -0.5"/><mass value="2"/>'
-        '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
-    )
-    robot = tmp_path / "robot.yaml"
-    robot.write_text(
-        f"/**:\n  ros__parameters:\n    robot_description: {urdf}\n    joints: [swing]\n"
-    )
-    ended = in_environment(environment, "estimate_acceleration_limits", robot, "--samples", "500")
-    assert ended.returncode == 0, ended.stderr
-    # (30 N m - 2 kg g 0.5 m) / 0.5 kg m^2
-    assert re.search(r"acceleration_max: \[40\.3", ended.stdout)
 
 
 @pytest.mark.parametrize("node", ["bounds_node", "controller_node"])

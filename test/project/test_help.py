@@ -10,8 +10,8 @@ import pytest
 
 from viability_bounds_pkg.testing.executables import run_to_end
 
-ROOT = Path(__file__).resolve().parents[2]
-SCRIPTS = ROOT / "scripts"
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+SOURCED = {"domain.sh", "environment.sh", "options.sh", "setup.sh"}
 EXECUTABLES = {
     entry.name: entry
     for package in ("viability_bounds_pkg", "torque_safety_controller", "sim_bridge")
@@ -20,53 +20,39 @@ EXECUTABLES = {
 }
 
 
-PARTS = {"domain.sh", "environment.sh", "options.sh"}
-"""What is only sourced by another script."""
-
-
-@pytest.mark.parametrize(
-    "script",
-    sorted(path for path in SCRIPTS.glob("*.sh") if path.name not in PARTS),
-    ids=lambda path: path.name,
-)
-def test_help_of_a_shell_script(script):
-    result = run_to_end("bash", script, "--help")
-    assert (result.returncode, result.stderr) == (0, "")
-    assert result.stdout.startswith("usage: ")
-    assert script.name in result.stdout.splitlines()[0]
-
-
-def test_help_of_a_script_that_is_sourced():
+def test_help_of_each_shell_script():
+    for script in sorted(SCRIPTS.glob("*.sh")):
+        if script.name not in SOURCED:
+            result = run_to_end("bash", script, "--help")
+            assert (result.returncode, result.stderr) == (0, ""), script
+            assert result.stdout.startswith("usage: ")
+            assert script.name in result.stdout.splitlines()[0]
     result = run_to_end("bash", "-c", f"source {SCRIPTS}/setup.sh --help && echo it goes on")
     assert result.stdout.startswith("usage: source scripts/setup.sh")
     assert result.stdout.endswith("it goes on\n")
 
 
-@pytest.mark.parametrize("script", sorted(SCRIPTS.glob("*.py")), ids=lambda path: path.name)
-def test_help_of_a_python_script(script, capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", [str(script), "--help"])
-    spec = importlib.util.spec_from_file_location(f"script_{script.stem}", script)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    with pytest.raises(SystemExit) as end:
-        module.main()
-    assert end.value.code == 0
-    assert capsys.readouterr().out.startswith(f"usage: {script.name}")
-
-
-def test_there_are_executables():
-    assert len(EXECUTABLES) >= 7
-
-
-@pytest.mark.parametrize("name", sorted(EXECUTABLES.keys() - {"moveit_node"}))
-def test_help_of_an_executable(name, capsys, monkeypatch):
+def help_of(main, name, capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", [name, "--help"])
     with pytest.raises(SystemExit) as end:
-        EXECUTABLES[name].load()()
+        main()
     assert end.value.code == 0
     out = capsys.readouterr().out
     assert out.startswith(f"usage: {name}")
     assert len(out.splitlines()) > 3
+
+
+@pytest.mark.parametrize("script", sorted(SCRIPTS.glob("*.py")), ids=lambda path: path.name)
+def test_help_of_a_python_script(script, capsys, monkeypatch):
+    spec = importlib.util.spec_from_file_location(f"script_{script.stem}", script)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    help_of(module.main, script.name, capsys, monkeypatch)
+
+
+@pytest.mark.parametrize("name", sorted(EXECUTABLES.keys() - {"moveit_node"}))
+def test_help_of_an_executable(name, capsys, monkeypatch):
+    help_of(EXECUTABLES[name].load(), name, capsys, monkeypatch)
 
 
 @pytest.mark.skipif(bool(importlib.util.find_spec("control_msgs")), reason="it is installed")

@@ -17,7 +17,6 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosidl_parser.definition import Array, BasicType, NamespacedType, UnboundedSequence
-from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
@@ -26,11 +25,10 @@ from sim_bridge.node.bullet_node import BulletNode
 from torque_safety_controller.node import controller_node
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.tools import gain_limits, identify_friction
-from viability_bounds_pkg.cli import estimate_acceleration_limits
 from viability_bounds_pkg.node import bounds_node, estimator_node
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros import arm_node, messages, program, robot_urdf
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, stamp_to_ns
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
 from viability_bounds_pkg.testing.ros_harness import (
     RosHarness,
     joint_state,
@@ -52,7 +50,6 @@ PROGRAMS = {
     "controller_node": controller_node.main,
     "bullet_node": bullet_node.main,
     "scenario_node": scenario_node.main,
-    "estimate_acceleration_limits": lambda a: estimate_acceleration_limits.main(a[1:]),
     "gain_limits": lambda a: gain_limits.main(a[1:]),
     "identify_friction": lambda a: identify_friction.main(a[1:]),
 }
@@ -62,13 +59,6 @@ LOG = re.compile(r"\[[A-Z]+\] \[[\d.]+\] \[[\w.]+\]: ")
 
 def of_kind(*kinds: str) -> list[Any]:
     return [pytest.param(m, id=m["did"]) for m in ALL if set(kinds) & set(m)]
-
-
-def test_there_are_many_and_no_two_are_the_same():
-    assert len(ALL) >= 80
-    assert len({mistake["did"] for mistake in ALL}) == len(ALL)
-    keys = ("run", "send", "set", "call", "scene")
-    assert all(len(set(keys) & set(mistake)) == 1 for mistake in ALL)
 
 
 # Command lines
@@ -228,20 +218,6 @@ def test_in_a_call(mistake, nodes):
 # What needs more than that
 
 
-def old_stamp(running):
-    running.start(BoundsNode)
-    stamps = itertools.cycle([2000, 1500])  # again, because a busy machine may lose the first
-    return lambda: running.publish(
-        "joint_states", joint_state(JOINTS, next(stamps) * MS, REST, ZERO)
-    )
-
-
-def same_stamp(running):
-    running.start(BoundsNode)
-    states = [joint_state(JOINTS, MS, q, ZERO) for q in (REST, ZERO)] * 500
-    return lambda: running.publish("joint_states", states.pop())
-
-
 def leaping_position(running):
     running.start(ControllerNode)
     stamps = itertools.count(1000 * MS, 2 * MS)
@@ -271,15 +247,6 @@ def other_rate(running):
     return send
 
 
-def short_command(running):
-    states = running.ros.listen(JointState, "joint_states")
-    running.start(BulletNode, clock="lockstep")
-    running.ros.wait_until(lambda: states, "a joint state")
-    stamp = stamp_to_ns(states[-1].header.stamp)
-    command = joint_state(JOINTS[1:], stamp, tau=ZERO[1:])
-    return lambda: running.publish("joint_commands", command)
-
-
 def stray_commands(running):
     running.start(BulletNode, clock="lockstep")
 
@@ -301,11 +268,6 @@ def other_type(running):
     running.start(ControllerNode)
     running.other = RosHarness(running.ros.domain)  # one context cannot have two types of a topic
     running.other.probe.create_publisher(String, "target_pose", GOAL_QOS)
-
-
-def two_robots(running):
-    running.start(BulletNode)
-    running.start(BulletNode)
 
 
 def no_clock(running):
