@@ -22,6 +22,8 @@ SESSIONS = [
 TARGET = np.array([0.4, 0.2, 0.5])  # m
 NEAR = 0.005  # m
 STACK = "simulated_stack --ros-args"
+UNHURRIED = "-p clock:=lockstep -p state_timeout:=60.0 -p bounds_timeout:=5.0"
+"""A busy machine may pause the robot; a controller drops its goal after such a silence."""
 BROKEN = "--bounds naive"
 """With it a limit is broken, says the page."""
 
@@ -68,6 +70,7 @@ def test_a_goal_from_the_script_is_reached_and_held_after_its_end(tree, ros):
         for program in programs:
             os.killpg(program.pid, signal.SIGINT)
         said = [program.communicate(timeout=60)[0] for program in programs]
+        print(*said, ros.diagnostics, poses[-1:])  # for who wants to know why it fails
     assert abs(start - TARGET).max() > 0.1, said
     assert max(map(distance, poses[count:])) < NEAR, said
     turn = poses[-1].pose.orientation
@@ -87,10 +90,10 @@ def distance(message):
 
 
 def typed(session, domain):
-    """Return a session of a terminal, in the domain of the test, and free of the wall clock."""
+    """Return a session of a terminal, in the domain of the test, and whatever else the machine does."""
     assert "ROS_DOMAIN_ID=7 " in session
     session = session.replace("ROS_DOMAIN_ID=7 ", f"ROS_DOMAIN_ID={domain} ")
-    return session.replace(STACK, f"{STACK} -p clock:=lockstep")
+    return session.replace(STACK, f"{STACK} {UNHURRIED}")
 
 
 def started(session, tree):
