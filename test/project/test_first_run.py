@@ -90,7 +90,7 @@ def distance(message):
 
 
 def typed(session, domain):
-    """Return a session of a terminal, in the domain of the test, and whatever else the machine does."""
+    """Return a session of a terminal, in the domain of the test."""
     assert "ROS_DOMAIN_ID=7 " in session
     session = session.replace("ROS_DOMAIN_ID=7 ", f"ROS_DOMAIN_ID={domain} ")
     return session.replace(STACK, f"{STACK} {UNHURRIED}")
