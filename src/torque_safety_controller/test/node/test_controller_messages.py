@@ -72,8 +72,9 @@ def test_limits_in_any_order_and_of_others_too(ros):
     only = np.linspace(-0.6, 0.6, ARM.n)
     values = [*reversed(only), math.nan]
     message = acceleration_limits([*reversed(JOINTS), "other"], 10 * MS, values, values)
-    tau = chain.await_command(10, lambda: (chain.limits.publish(message), chain.state(10)))
-    np.testing.assert_allclose(tau, torque_for(Q, only), atol=1e-3)
+    command = chain.await_command(10, lambda: (chain.limits.publish(message), chain.state(10)))
+    assert command.name == JOINTS
+    np.testing.assert_allclose(command.effort, torque_for(Q, only), atol=1e-3)
 
 
 # Goals

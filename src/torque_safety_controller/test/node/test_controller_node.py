@@ -3,7 +3,6 @@
 
 import math
 import re
-from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -115,12 +114,8 @@ class Motors:
         for _ in range(count):
             self.stamp += 10
             given = self.tau if effort is None else effort
-
-            def send(given=given):
-                self.chain.bound(self.stamp)
-                self.chain.send_state(self.stamp, Q, REST, given)
-
-            self.tau = self.chain.await_command(self.stamp, send)
+            command = self.chain.ask(self.stamp, Q, REST, LOWER, UPPER, given)
+            self.tau = np.array(command.effort)
         rest = expected().step(State(Q, REST), BOUNDS, HELD).tau
         goal = expected(posture=GOAL_Q).step(State(Q, REST), BOUNDS).tau
         return np.abs(self.tau - rest).max() / np.abs(goal - rest).max()
@@ -174,11 +169,13 @@ def goes_on_when_it_rests(chain, stamps, why):
 def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
     chain = NodeChain(ros, bounds_timeout=0.1)
     stamp = give_goal(chain)
-    tau = chain.await_command(stamp + 10, lambda: chain.state(stamp + 10))
+    command = chain.await_command(stamp + 10, lambda: chain.state(stamp + 10))
     chain.await_mode("HOLD", "acceleration limits are stale")
     assert float(chain.reported("goal_share")) == 0.0  # within margins it returns gently, too
     hold = expected(GOAL).step(State(Q, V), None, HELD)
-    np.testing.assert_allclose(tau, hold.tau, atol=0.5)  # the node's last acceleration differs
+    np.testing.assert_allclose(
+        command.effort, hold.tau, atol=0.5
+    )  # the node's last acceleration differs
     # The next ones are held at once.
     for k in range(20, 25):
         chain.await_command(stamp + k, lambda k=k: chain.state(stamp + k))
@@ -197,21 +194,6 @@ def test_a_controller_that_was_paused_in_motion_lets_the_arm_come_to_rest(ros):
     stamps = iter(range(stamp + 401, stamp + 2000))
     chain.answer(stamp + 400)
     goes_on_when_it_rests(chain, stamps, "states were not answered")
-
-
-def test_slow_robots_are_not_taken_for_missing_bounds(ros):
-    """The time-out counts from the state, not from the last answer."""
-    chain = NodeChain(ros, bounds_timeout=0.8)
-    stamp = give_goal(chain)
-    ros.wait_until(lambda: chain.reported("mode") == "TRACKING")
-    changes = chain.reported("mode_changes")
-    ros.run_for(0.85)  # longer than the time-out
-    chain.state(stamp + 1)
-    ros.run_for(0.25)  # longer than the watchdog's period: it looks while limits are due
-    chain.await_command(stamp + 1, lambda: chain.bound(stamp + 1))
-    ros.diagnostics.clear()
-    chain.await_mode("TRACKING")
-    assert chain.reported("mode_changes") == changes
 
 
 @pytest.mark.parametrize("bad", ["not finite", "missing joint"])
@@ -255,17 +237,6 @@ def test_an_estimate_without_a_solution_is_held_and_forgotten(ros):
     chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps), v=REST))
 
 
-def test_stamps_that_stay_old_are_taken_for_a_restart(ros):
-    chain = NodeChain(ros, bounds_timeout=0.1, state_timeout=1.2)
-    stamp = give_goal(chain) + 1000
-    chain.answer(stamp)
-    earlier = iter(range(10, stamp))
-    chain.await_mode(
-        "STOPPED", "joint states are refused: old stamp", each=lambda: chain.both(next(earlier))
-    )
-    chain.await_mode("TRACKING", each=lambda: chain.both(next(earlier), v=REST))
-
-
 def test_silence_stops_it_and_a_state_wakes_it(ros):
     chain = NodeChain(ros, state_timeout=0.2, bounds_timeout=0.1)
     stamp = give_goal(chain)
@@ -282,23 +253,6 @@ def test_silence_stops_it_and_a_state_wakes_it(ros):
 # Stamps
 
 
-@pytest.mark.parametrize("order", ["limits first", "state first"])
-def test_state_and_limits_are_matched_in_either_order(ros, order):
-    chain = NodeChain(ros)
-    chain.answer(10)
-    # Limits that leave no choice show in the torque which of them were used.
-    for stamp, a in ((20, 0.5), (30, -0.5)):
-        only = np.full(ARM.n, a)
-        send = {
-            "limits first": partial(chain.bound, stamp, only, only),
-            "state first": partial(chain.state, stamp),
-        }[order]
-        ros.run_for(0.05, each=send)
-        assert stamp * MS not in chain.commands.stamps
-        tau = chain.answer(stamp, lower=only, upper=only)
-        np.testing.assert_allclose(tau, torque_for(Q, only), atol=1e-3)
-
-
 def test_old_limits_are_never_used_for_a_new_state(ros):
     chain = NodeChain(ros)
     chain.answer(10)
@@ -307,20 +261,9 @@ def test_old_limits_are_never_used_for_a_new_state(ros):
     ros.run_for(0.1, each=lambda: chain.bound(10))
     ros.run_for(0.1, each=lambda: chain.bound(30))
     assert set(chain.commands.stamps) == {10 * MS}
-    chain.await_command(20, lambda: chain.bound(20))
-
-
-def test_a_robot_that_starts_over_at_the_same_stamp_does_not_get_the_old_limits(ros):
-    chain = NodeChain(ros, state_timeout=0.2, bounds_timeout=20.0)
-    chain.answer(10)
-    chain.await_mode("STOPPED")
-    chain.commands.clear()
-    moved = Q + 0.05
-    ros.run_for(0.1, each=lambda: chain.state(10, moved))
-    assert not chain.commands
-    only = np.full(ARM.n, 0.5)
-    tau = chain.answer(10, moved, lower=only, upper=only)
-    np.testing.assert_allclose(tau, torque_for(moved, only), atol=1e-3)
+    only = np.full(ARM.n, 0.5)  # which leaves no choice
+    command = chain.await_command(20, lambda: chain.bound(20, only, only))
+    np.testing.assert_allclose(command.effort, torque_for(Q, only), atol=1e-3)
 
 
 def test_a_repeated_state_gets_the_same_command_again(ros):

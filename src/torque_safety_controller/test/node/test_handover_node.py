@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 import numpy as np
 import pytest
@@ -50,25 +49,15 @@ class HandoverChain(ControllerChain):
     def answer(self, q=Q, tau=TAU, bounds=True) -> JointState:
         """Send the next state, and limits, until the command comes; return that."""
         self.stamp += 1
-        stamp = self.stamp
-
-        def send():
-            if bounds:
-                self.bound(stamp)
-            self.state(stamp, q, tau)
-
-        return self.await_command(stamp, send)
+        if bounds:
+            return self.ask(self.stamp, q, np.zeros(N), -WIDE, WIDE, tau)
+        return self.await_command(self.stamp, lambda: self.state(self.stamp, q, tau))
 
     def call(self, torque: bool) -> SetBool.Response:
         return self.ros.call(SetBool, SERVICE, SetBool.Request(data=torque))
 
     def enable(self, torque: bool) -> None:
-        """Call the service, with a new state where the machine was slower than the watchdog."""
         response = self.call(torque)
-        deadline = time.monotonic() + 10.0
-        while "only old ones" in response.message and time.monotonic() < deadline:
-            self.answer()
-            response = self.call(torque)
         assert response.success, response.message
 
     def take_over(self, q=Q, tau=TAU) -> np.ndarray:
@@ -157,15 +146,6 @@ def test_a_call_between_a_state_and_its_limits_is_obeyed(ros):
     assert ros.reported(NODE, "control") == "position"
 
 
-def test_a_handover_that_was_asked_for_can_be_called_off(ros):
-    chain = HandoverChain(ros)
-    chain.answer()
-    chain.enable(True)
-    chain.enable(False)
-    for _ in range(3):
-        assert_position(chain.answer(Q + 0.01))
-
-
 def test_goals_from_before_the_handover_are_dropped(ros):
     chain = HandoverChain(ros)
     chain.answer()
@@ -198,17 +178,6 @@ def test_efforts_for_ros2_control_are_silent_under_position_control(ros):
 # Refused
 
 
-def test_torque_is_refused_before_the_first_state_and_while_states_are_old(ros):
-    chain = HandoverChain(ros, bounds_timeout=0.1)
-    assert "no joint state" in chain.refuses(True)
-    assert "position control is on already" in chain.refuses(False)
-    assert_position(chain.answer())
-    ros.run_for(0.15)
-    assert "no joint state, or only old ones" in chain.refuses(True)
-    chain.answer()
-    chain.enable(True)
-
-
 @pytest.mark.parametrize("stamp", [1, 1_000_000])
 def test_torque_is_refused_while_limits_are_old_or_of_another_run(ros, stamp):
     chain = HandoverChain(ros, bounds_timeout=5.0)
@@ -222,15 +191,14 @@ def test_torque_is_refused_while_limits_are_old_or_of_another_run(ros, stamp):
 
 
 def test_torque_is_refused_where_it_cannot_begin(ros):
-    chain = HandoverChain(ros)
-    for tau, reason in (
-        ((), "no motor torque"),
-        ([*TAU[:6], 1.1 * TAU_MAX[6]], f"motor torque beyond torque_max: {JOINTS[6]}"),
-    ):
-        chain.answer(Q, tau)
-        assert reason in chain.refuses(True)
-        assert_position(chain.answer(Q, tau))
-    chain.await_report(control="position")
+    chain = HandoverChain(ros, bounds_timeout=1.0)
+    assert "no joint state" in chain.refuses(True)
+    assert "position control is on already" in chain.refuses(False)
+    chain.answer(Q, ())
+    assert "no motor torque" in chain.refuses(True)
+    assert_position(chain.answer())
+    ros.run_for(1.1)
+    assert "no joint state, or only old ones" in chain.refuses(True)
     chain.answer()
     chain.take_over()
     assert "torque control is on already" in chain.refuses(True)
@@ -240,7 +208,7 @@ def test_torque_is_refused_where_it_cannot_begin(ros):
 
 
 def test_a_handover_ends_where_limits_stop_coming(ros):
-    chain = HandoverChain(ros, bounds_timeout=0.2)
+    chain = HandoverChain(ros, bounds_timeout=1.0)
     chain.answer()
     chain.enable(True)
     # Repeated, as by a robot in lockstep, and not answered until then.
@@ -248,17 +216,6 @@ def test_a_handover_ends_where_limits_stop_coming(ros):
     failed = "handover failed: acceleration limits are stale"
     chain.await_report(mode="POSITION", reason=failed, control="position")
     assert_position(chain.answer(bounds=False))
-
-
-def test_a_handover_ends_where_torque_cannot_begin_after_all(ros):
-    chain = HandoverChain(ros)
-    chain.answer()
-    chain.enable(True)
-    chain.stamp += 100  # a gap, after which the arm may be elsewhere
-    assert_position(chain.answer(Q + 5.0))
-    chain.await_report(
-        mode="POSITION", reason="handover failed: outside the position limits", control="position"
-    )
 
 
 def test_nothing_is_sent_once_it_is_stopped(ros):

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from arms import load_arm
@@ -93,12 +91,9 @@ def test_each_parameter_reaches_the_torque(changed, by_hand, without):
     ("name", "value", "allowed"),
     [
         ("integral_action", "plain", "one of none, joints, task, position"),
-        ("integral_budget", [1.0], "7 numbers"),
         ("integral_budget", [-1.0, *ARM.tau_max[1:]], ">= 0"),
-        ("integral_budget", [math.nan, *ARM.tau_max[1:]], "finite"),
         ("integral_budget", [87.1, *ARM.tau_max[1:]], "at most torque_max"),
         ("integral_lambda", 0.5, ">= 1"),
-        ("integral_lambda", math.inf, "<= 1000"),
         ("integral_anti_windup", "qp2", "one of qp, paper, scaling"),
     ],
 )
@@ -131,19 +126,7 @@ class IntegralChain(ControllerChain):
     def answer(self, v, period=PERIOD) -> np.ndarray:
         """Return the torques for the next state."""
         self.stamp += period
-        stamp = self.stamp
-
-        def send():
-            self.send_limits(stamp, -WIDE, WIDE)
-            self.send_state(stamp, Q, v)
-
-        return np.array(self.await_command(stamp, send).effort)
-
-    def added(self) -> np.ndarray:
-        """Return the additional torque that is reported from now on."""
-        self.ros.diagnostics.clear()
-        self.ros.wait_until(lambda: self.reported("additional_torque_nm"))
-        return np.array(self.reported("additional_torque_nm").split(), float)
+        return np.array(self.ask(self.stamp, Q, v).effort)
 
 
 def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
@@ -182,23 +165,10 @@ def test_a_robot_that_pauses_or_whose_clock_jumps_gets_no_kick(ros, gap):
     chain = IntegralChain(ros, integral_lambda=30.0)
     for _ in range(20):
         before = chain.answer(SPEEDS[3])
-    assert np.abs(chain.added() / ARM.tau_max).max() > 0.01
+    ros.wait_until(lambda: chain.reported("steps") == "20")
+    added = np.array(chain.reported("additional_torque_nm").split(), float)
+    assert np.abs(added / ARM.tau_max).max() > 0.01
     after = chain.answer(SPEEDS[3], gap)
     assert (np.abs(after - before) < 1e-3 * ARM.tau_max).all()
     assert (np.abs(chain.answer(SPEEDS[3]) - after) < 5e-3 * ARM.tau_max).all()
     ros.wait_until(lambda: chain.reported("integral_skipped_steps") == "1")
-
-
-def test_states_that_cannot_be_used_do_not_move_the_integral(ros):
-    """While they come nothing is sent, so that the robot stops itself."""
-    chain = IntegralChain(ros, bounds_timeout=0.1)
-    for v in SPEEDS:
-        chain.answer(v)
-    before = chain.added()
-    chain.commands.clear()
-    ros.wait_until(
-        lambda: chain.reported("mode") == "STOPPED",
-        each=lambda: chain.send_state(chain.stamp + 1, np.full(N, math.nan), np.zeros(N)),
-    )
-    assert not chain.commands
-    np.testing.assert_array_equal(chain.added(), before)

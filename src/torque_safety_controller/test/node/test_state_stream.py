@@ -51,13 +51,3 @@ def test_what_a_state_is_after_one_that_was_answered(stream, stamp, q, now, arri
     assert arrives(stream, stamp, now, q) is arrival
     accepted = arrival in (Arrival.NEW, Arrival.RESTARTED)
     np.testing.assert_array_equal(stream.q, q if accepted else Q)
-
-
-def test_the_first_of_several_states_waits_until_one_is_answered(stream):
-    assert stream.waits(20.0) == 0.0
-    arrives(stream, 102, 10.1)
-    arrives(stream, 104, 10.3)
-    assert stream.waits(10.4) == pytest.approx(0.3)
-    assert stream.elapsed() == pytest.approx(4e-3)
-    stream.mark_answered()
-    assert (stream.waits(10.6), stream.elapsed()) == (0.0, 0.0)

@@ -23,27 +23,30 @@ PLANE = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]  # from the lowest point towards y
 BASE = pin.SE3(pin.utils.rotate("z", 0.7), np.array([0.1, 0.2, 0.3]))
 
 
-def message_of(points, stamp=0, frame="base", joint_names=()) -> MultiDOFJointTrajectory:
+def twist_of(values) -> Twist:
+    made = Twist()
+    for vector, part in ((made.linear, values[:3]), (made.angular, values[3:])):
+        vector.x, vector.y, vector.z = map(float, part)
+    return made
+
+
+def message_of(points, stamp=0, frame="base") -> MultiDOFJointTrajectory:
     """Return points, given in the base frame, as a message."""
-    message = MultiDOFJointTrajectory(joint_names=list(joint_names))
+    message = MultiDOFJointTrajectory()
     message.header.frame_id = frame
     set_stamp(message.header.stamp, stamp)
     for point in points:
-        entry = MultiDOFJointTrajectoryPoint(transforms=[Transform()])
-        t, o = entry.transforms[0].translation, entry.transforms[0].rotation
+        transform = Transform()
+        t, o = transform.translation, transform.rotation
         t.x, t.y, t.z = map(float, point.pose.translation)
         o.x, o.y, o.z, o.w = map(float, pin.Quaternion(point.pose.rotation).coeffs())
-        for twists, values in (
-            (entry.velocities, point.velocity),
-            (entry.accelerations, point.acceleration),
-        ):
-            twist = Twist()
-            for vector, part in ((twist.linear, values[:3]), (twist.angular, values[3:])):
-                vector.x, vector.y, vector.z = map(float, part)
-            twists.append(twist)
-        nanoseconds = round(1e9 * point.time)
-        entry.time_from_start.sec = nanoseconds // 10**9
-        entry.time_from_start.nanosec = nanoseconds % 10**9
+        entry = MultiDOFJointTrajectoryPoint(
+            transforms=[transform],
+            velocities=[twist_of(point.velocity)],
+            accelerations=[twist_of(point.acceleration)],
+        )
+        entry.time_from_start.nanosec = round(1e9 * point.time) % 10**9
+        entry.time_from_start.sec = round(1e9 * point.time) // 10**9
         message.points.append(entry)
     return message
 
@@ -101,7 +104,8 @@ def test_it_is_followed_in_the_robots_time(ros):
         "disturbance_time": 0.0,
     }
     chain = ControllerChain(ros, values)
-    q, v, wide = arm.q_start, np.zeros(arm.n), np.full(arm.n, 50.0)
+    q, v = arm.q_start, np.zeros(arm.n)
+    wide = AccelerationRange(np.full(arm.n, -50.0), np.full(arm.n, 50.0))
     core = make(arm, gains=gains_of(values))
     core.reset(q)
     points = circle(pose_at(arm, q), 0.05, PLANE, period=0.02, points_per_turn=8)
@@ -110,14 +114,9 @@ def test_it_is_followed_in_the_robots_time(ros):
     goals.publish(message_of(points, stamp=20 * MS, frame=""))
     chain.await_goals()
     for stamp in range(20, 50, 2):
-
-        def send(stamp=stamp):
-            chain.send_limits(stamp, -wide, wide)
-            chain.send_state(stamp, q, v)
-
         core.goals.set_pose(*meant.sample(1e-3 * (stamp - 20)))
-        wanted = core.step(State(q, v), AccelerationRange(-wide, wide)).tau
-        found = chain.await_command(stamp, send).effort
+        wanted = core.step(State(q, v), wide).tau
+        found = chain.ask(stamp, q, v).effort
         np.testing.assert_allclose(found, wanted, atol=1e-4, err_msg=f"at {stamp} ms")  # N m
     # It ends where it began.
     ros.wait_until(lambda: float(chain.reported("position_error_m") or "nan") < 1e-6)

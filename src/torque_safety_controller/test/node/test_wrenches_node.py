@@ -17,8 +17,8 @@ from torque_safety_controller.node.goal_messages import numbers_of
 from torque_safety_controller.parts.contact.interaction import Interaction
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot.description import inertia_beyond, read_urdf
-from viability_bounds_pkg.ros.messages import pose_message
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, set_stamp
+from viability_bounds_pkg.ros.messages import pose_message, wrench_message
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 
@@ -44,15 +44,7 @@ def weight() -> np.ndarray:
 
 
 WEIGHT = weight()
-
-
-def wrench(force=(0.0, 0.0, 0.0), torque=(0.0, 0.0, 0.0), frame="", stamp=0) -> WrenchStamped:
-    message = WrenchStamped()
-    message.header.frame_id = frame
-    set_stamp(message.header.stamp, stamp)
-    for vector, values in ((message.wrench.force, force), (message.wrench.torque, torque)):
-        vector.x, vector.y, vector.z = map(float, values)
-    return message
+STILL = (0.0, 0.0, 0.0)
 
 
 class WrenchChain(ControllerChain):
@@ -69,16 +61,11 @@ class WrenchChain(ControllerChain):
     def step(self) -> np.ndarray:
         """Let 2 ms of robot time pass; return the torques."""
         self.stamp += 2
-        wide = np.full(ARM.n, 50.0)
-
-        def send() -> None:
-            if self.feels is not None:
-                values = numbers_of(self.feels.wrench.force, self.feels.wrench.torque) + WEIGHT
-                self.measured.publish(wrench(values[:3], values[3:], self.feels.header.frame_id))
-            self.send_limits(self.stamp, -wide, wide)
-            self.send_state(self.stamp, ARM.q_start, np.zeros(ARM.n))
-
-        tau = np.array(self.await_command(self.stamp, send).effort)
+        if self.feels is not None:
+            values = numbers_of(self.feels.wrench.force, self.feels.wrench.torque) + WEIGHT
+            frame = self.feels.header.frame_id
+            self.measured.publish(wrench_message(frame, values[:3], values[3:]))
+        tau = np.array(self.ask(self.stamp, ARM.q_start, np.zeros(ARM.n)).effort)
         assert np.isfinite(tau).all()
         assert (np.abs(tau) <= ARM.tau_max).all()
         return tau
@@ -95,10 +82,10 @@ class WrenchChain(ControllerChain):
 
 def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
     hand = WrenchChain(ros)
-    hand.feels = wrench(force=(1.0, 0.0, 0.0), frame="panda_link8")
+    hand.feels = wrench_message("panda_link8", (1.0, 0.0, 0.0))
     hand.give_pose()
     hand.until("compliance", "holding")
-    hand.feels = wrench(force=(0.0, 30.0, 0.0), frame="panda_link8")
+    hand.feels = wrench_message("panda_link8", (0.0, 30.0, 0.0))
     hand.until("compliance", "yielding")
     assert "threshold" in hand.reported("compliance_reason")
     hand.feels = None
@@ -106,7 +93,7 @@ def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
     assert hand.reported("mode") == "TRACKING"
     assert hand.reported("level") == DiagnosticStatus.WARN
     assert "sensor is silent" in hand.reported("message")
-    hand.feels = wrench(force=(0.0, 30.0, 0.0))
+    hand.feels = wrench_message("", (0.0, 30.0, 0.0))
     hand.until("compliance", "yielding")
     # An empty threshold switches it off.
     ros.accepts(NODE, yield_threshold=[])
@@ -115,12 +102,12 @@ def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
 
 def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
     hand = WrenchChain(ros)
-    hand.feels = wrench(force=(0.0, 30.0, math.nan), frame="panda_link8")
+    hand.feels = wrench_message("panda_link8", (0.0, 30.0, math.nan))
     hand.give_pose()
     hand.until("wrenches_refused", "not six finite numbers")
-    hand.feels = wrench(force=(0.0, 30.0, 0.0), frame="moon")
+    hand.feels = wrench_message("moon", (0.0, 30.0, 0.0))
     hand.until("wrenches_refused", "another frame_id")
-    hand.feels = wrench(force=(0.0, 1e300, 0.0))
+    hand.feels = wrench_message("", (0.0, 1e300, 0.0))
     hand.until("wrenches_refused", "beyond 100000 N or N m")
     assert hand.reported("compliance") == "sensor silent"
 
@@ -128,17 +115,21 @@ def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
 def test_targets_that_cannot_be_exerted_are_refused_and_others_are_exerted(ros):
     """In contact with what gives exactly that back, the motors carry it."""
     hand = WrenchChain(ros, yield_threshold=[])
-    hand.feels = wrench()
+    hand.feels = wrench_message("", STILL)
     hand.give_pose()
     before = hand.step()
     for k, message in enumerate(
-        (wrench(force=(0.0, 0.0, math.inf)), wrench(force=(0.0, 0.0, 1e300)), wrench(frame="moon"))
+        (
+            wrench_message("", (0.0, 0.0, math.inf)),
+            wrench_message("", (0.0, 0.0, 1e300)),
+            wrench_message("moon", STILL),
+        )
     ):
         hand.targets.publish(message)
         hand.until("goals_refused", f"target_wrench: {k + 1};")
     assert hand.reported("compliance") != "force"
-    hand.targets.publish(wrench(force=(0.0, 0.0, 10.0), frame="panda_hand"))
-    hand.feels = wrench(force=(0.0, 0.0, -10.0))
+    hand.targets.publish(wrench_message("panda_hand", (0.0, 0.0, 10.0)))
+    hand.feels = wrench_message("", (0.0, 0.0, -10.0))
     hand.until("compliance", "force")
     robot = ARM.robot(0.0)
     robot.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
@@ -150,25 +141,16 @@ def test_targets_that_cannot_be_exerted_are_refused_and_others_are_exerted(ros):
     ros.wait_until(lambda: missing() < 0.05, "the torques of the target")  # N m
 
 
-def test_without_a_direction_that_is_controlled_no_target_is_exerted(ros):
-    hand = WrenchChain(ros, force_directions=[0.0] * 6)
-    hand.feels = wrench()
-    hand.give_pose()
-    hand.targets.publish(wrench(force=(0.0, 0.0, 10.0)))
-    hand.until("goals_refused", "target_wrench")
-    assert hand.reported("compliance") != "force"
-
-
 def test_after_the_strongest_wrenches_that_are_taken_the_arm_goes_on(ros):
     """Sums, squares and filters of larger ones would not be finite for ever."""
     hand = WrenchChain(ros)
     most = 0.999e5  # N; without the weight of the hand
-    hand.feels = wrench(force=(most, -most, most), frame="panda_link8")
+    hand.feels = wrench_message("panda_link8", (most, -most, most))
     hand.give_pose()
-    hand.targets.publish(wrench(force=(1e5, 1e5, -1e5), frame="panda_hand"))
+    hand.targets.publish(wrench_message("panda_hand", (1e5, 1e5, -1e5)))
     hand.until("compliance", "force")
-    hand.feels = wrench()
-    hand.targets.publish(wrench(force=(0.0, 0.0, 1.0), frame="panda_hand"))
+    hand.feels = wrench_message("", STILL)
+    hand.targets.publish(wrench_message("panda_hand", (0.0, 0.0, 1.0)))
     hand.until("target_wrench", "1")
     for _ in range(200):  # 0.4 s
         hand.step()
@@ -177,14 +159,14 @@ def test_after_the_strongest_wrenches_that_are_taken_the_arm_goes_on(ros):
 
 def test_a_tare_takes_what_is_felt_for_the_bias_but_not_from_a_hand_that_is_led(ros):
     hand = WrenchChain(ros)
-    hand.feels = wrench(force=(4.0, 0.0, 0.0))
+    hand.feels = wrench_message("", (4.0, 0.0, 0.0))
     hand.give_pose()
     for _ in range(3):
         hand.step()
     answer = ros.call(Trigger, f"{NODE}/tare_ft_sensor", Trigger.Request())
     assert answer.success
     hand.until("ft_bias", "4 ")
-    hand.feels = wrench(force=(40.0, 0.0, 0.0))
+    hand.feels = wrench_message("", (40.0, 0.0, 0.0))
     hand.until("compliance", "yielding")
     answer = ros.call(Trigger, f"{NODE}/tare_ft_sensor", Trigger.Request())
     assert not answer.success

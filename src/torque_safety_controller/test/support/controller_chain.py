@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
@@ -84,6 +85,16 @@ class ControllerChain:
             lambda: stamp * MS in self.commands.stamps, f"a command for {stamp}", each=each
         )
         return self.commands[self.commands.stamps.index(stamp * MS)]
+
+    def ask(self, stamp: int, q, v, lower=-50.0, upper=50.0, tau=None) -> JointState:
+        """Send a state and its limits, rad/s^2, until the command comes; return that."""
+        n = len(self.joints)
+
+        def send() -> None:
+            self.send_limits(stamp, np.broadcast_to(lower, n), np.broadcast_to(upper, n))
+            self.send_state(stamp, q, v, tau)
+
+        return self.await_command(stamp, send)
 
     def await_goals(self, count: int = 1) -> None:
         """Wait until so many goals have come that no state has brought into effect yet."""

@@ -78,15 +78,9 @@ class NodeChain(ControllerChain):
         self.bound(stamp, lower, upper)
         self.state(stamp, q, v)
 
-    def await_command(self, stamp, each=None) -> np.ndarray:
-        """Wait for the command with a stamp, ms; return its torques."""
-        command = super().await_command(stamp, each)
-        assert command.name == JOINTS
-        return np.array(command.effort)
-
     def answer(self, stamp, q=Q, v=V, lower=LOWER, upper=UPPER) -> np.ndarray:
         """Send a state and its limits until the command comes; return its torques."""
-        return self.await_command(stamp, lambda: self.both(stamp, q, v, lower, upper))
+        return np.array(self.ask(stamp, q, v, lower, upper).effort)
 
     def await_mode(self, mode, reason="", each=None) -> None:
         self.ros.wait_until(

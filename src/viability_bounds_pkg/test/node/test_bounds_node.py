@@ -99,18 +99,12 @@ def test_answers_are_the_exact_bounds_with_the_stamp_of_the_state(ros):
         check(answer, bounds)
         seen.add(tuple(bounds.viable))
     assert len(seen) > 4, "the states hardly differ"
-    # The same state again gets the same answer and does not count; nor do states refused.
-    assert robot.ask(k * ELSEWHERE + k, q, v) == answer
-    ros.wait_until(lambda: ros.reported(NODE, "states_answered") == "15", "15 states")
-
-
-def test_joints_in_any_order_and_others_with_them(ros):
-    robot = BoundsProbe(ros)
+    # The same state again gets the same answer and does not count, whatever the order of names.
     order = [2, 0, 1]
-    q, v = np.array(NEAR)
     names = [*(JOINTS[i] for i in order), "other"]
-    answer = robot.ask(10 * MS, [*q[order], math.nan], [*v[order], 0.0], names)
-    check(answer, exact(q, v))
+    again = robot.ask(k * ELSEWHERE + k, [*q[order], math.nan], [*v[order], 0.0], names)
+    assert again == answer
+    ros.wait_until(lambda: ros.reported(NODE, "states_answered") == "15", "15 states")
 
 
 def test_distances_to_limits_are_shown_by_joint_until_the_robot_is_silent(ros):
@@ -241,26 +235,20 @@ def test_a_horizon_that_is_too_long_for_the_limits_is_shortened(shared_ros):
 @pytest.mark.parametrize(
     ("changed", "name", "shown"),
     [
-        ({"position_min": [-1.0, 2.0, -math.inf]}, "position_max", "2"),
         ({"position_min": [math.inf, -0.5, -math.inf]}, "position_min", "inf"),
         ({"velocity_max": [1.0, math.inf, 3.0]}, "velocity_max", "inf"),
-        ({"velocity_max": None}, "velocity_max", "not set"),
         ({"acceleration_min": [-1.0, 0.0, -1.0]}, "acceleration_min", "0"),
         ({"acceleration_max": [1.0, -4.0, 1.0]}, "acceleration_max", "-4"),
         ({"acceleration_drift": [1.0, -1.0, 1.0]}, "acceleration_drift", "-1"),
         ({"position_margin": -1e-3}, "position_margin", "-0.001"),
         ({"torque_max": [1.0]}, "torque_max", "3 numbers"),
-        ({"robot_description": "/nowhere.urdf"}, "robot_description", "/nowhere.urdf"),
-        ({"rate_hz": 0.0}, "rate_hz", "0"),
         ({"method": "magic"}, "method", "'magic'"),
         ({"bounds_dt_factor": math.nan}, "bounds_dt_factor", "nan"),
-        ({"state_timeout": 0.0}, "state_timeout", "0"),
         ({"missed_deadlines": -1}, "missed_deadlines", "-1; allowed: a whole number"),
         ({"delay": 101}, "delay", "101; allowed: a whole number"),
         ({"motor_bandwidth": [-1.0, 1.0, 1.0]}, "motor_bandwidth", ">= 0"),
         # Declarations that leave nothing.
         ({"velocity_error": [0.1, 1.2, 0.1]}, "velocity_error", "less at 100 Hz (velocity_error"),
-        ({"position_error": [1.5, 0.0, 0.0]}, "position_error", "less at 100 Hz (position_error"),
     ],
 )
 def test_it_does_not_start_with_bad_parameters(shared_ros, changed, name, shown):

@@ -23,7 +23,6 @@ from viability_bounds_pkg.parameter import (
     texts,
     whole_number,
 )
-from viability_bounds_pkg.robot.configuration import RobotConfiguration
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.given_parameters import remember_arguments
 from viability_bounds_pkg.ros.parameters import NodeParameters, UnknownParameterError
@@ -197,13 +196,6 @@ def test_changes_that_fit_only_together_are_made_at_once(ros):
     assert node.config.changing == (8.0, 6.0, "round")
 
 
-def test_parameters_of_others_are_left_alone(ros):
-    node = start(ros)
-    node.declare_parameter("mine", 1.0)
-    ros.accepts("tunable", mine=2.0)
-    assert node.changes == []
-
-
 def test_descriptions_tell_what_may_change_and_to_what(ros):
     node = start(ros)
     gain = node.describe_parameter("gain")
@@ -222,13 +214,3 @@ def test_descriptions_tell_what_may_change_and_to_what(ros):
         ("enabled", ""),
     ):
         assert node.describe_parameter(name).additional_constraints == expected
-
-
-def test_locked_joints():
-    given = {"robot_description": "", "joints": ["z"], "torque_max": [1.0]}
-    given |= {"position_min": [-1.0], "position_max": [1.0]}
-    given |= {"locked_joints": ["x", "y"], "locked_positions": [0.5, -1.0]}
-    assert read(RobotConfiguration, given).locked == {"x": 0.5, "y": -1.0}
-    for bad in ([0.5], [0.5, math.nan]):
-        with pytest.raises(SettingError, match="'locked_positions'"):
-            read(RobotConfiguration, given | {"locked_positions": bad})
