@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """State -> limits -> command in one process: the real nodes against nodes that only relay.
 
-All chains live in one process on one executor, and are driven in turns by the same probe, so that
-what differs is the work of the nodes, and the way of messages: from node to node as in
-`safety_stack` ("one process"), or by the middleware. Each chain has its own simulated arm, moved
-outside the measured time: the real chain's by its commands, through the demo's goals and into the
-limits; the relays' by gravity compensation. The first cycles of a turn take two to five times as
-long, because the caches hold another chain; turns are so long that these are less than a percent.
-With ``--imperfect`` a further chain has what ``config/imperfect/`` declares, and the estimator
-node, with messages by the middleware.
+All chains live in one process on one executor, and are driven in turns by probes, so that what
+differs is the work of the nodes, and the way of messages: from node to node as in `safety_stack`
+("one process"), or by the middleware. Each chain has its own simulated arm, moved outside the
+measured time: the real chain's by its commands, through the demo's goals and into the limits; the
+relays' by gravity compensation. With ``--imperfect`` a further chain has what
+``config/imperfect/`` declares, and the estimator node, with messages by the middleware.
 """
 
 from __future__ import annotations

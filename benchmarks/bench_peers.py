@@ -83,7 +83,7 @@ class Clamp:
 
 def rollout(dt: float, goals: int) -> dict[str, Any]:
     """Return arm, limits and goals."""
-    given = problem(dt, kp=KP, kd=KD)
+    given = problem(dt, posture_kp=KP, posture_kd=KD)
     low, high = given["low"], given["high"]
     rng = np.random.default_rng(0)
     postures, side = rng.uniform(low, high, (goals, 7)), rng.random((goals, 7))

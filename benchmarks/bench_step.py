@@ -32,7 +32,13 @@ from viability_bounds_pkg.state import State
 from viability_bounds_pkg.viability import BoundsSolver
 
 DT = 0.002  # s
-GAINS = {"pose_kp": 30.0, "pose_kd": 11.0, "kp": 10.0, "kd": 6.3, "posture_weight": 1e-3}
+GAINS = {
+    "pose_kp": 30.0,
+    "pose_kd": 11.0,
+    "posture_kp": 10.0,
+    "posture_kd": 6.3,
+    "posture_weight": 1e-3,
+}
 STEPS_PER_GOAL = 500
 REGULARISATION = 1e-8
 """What TSID adds to its Hessian; ours otherwise has 1e-6, relative to the largest weight."""
@@ -67,14 +73,7 @@ class Ours:
         self.model = build_model(given["urdf"], JOINTS)
         self.low, self.high = given["low"], given["high"]
         self.bounds = BoundsSolver(limits_of(given), 2.0 * DT)
-        gains = Gains(
-            pose_kp=GAINS["pose_kp"],
-            pose_kd=GAINS["pose_kd"],
-            posture_kp=GAINS["kp"],
-            posture_kd=GAINS["kd"],
-            posture_weight=GAINS["posture_weight"],
-        )
-        goals = (TsidGoals if as_tsid else Goals)(self.model.nv, gains)
+        goals = (TsidGoals if as_tsid else Goals)(self.model.nv, Gains(**GAINS))
         middle = 0.5 * (self.low + self.high)
         self.controller = make_controller(
             self.model, goals, 0.0 if as_tsid else DT, middle, solver

@@ -43,8 +43,8 @@ class Tsid:
             self._pose.useLocalFrame(True)
             self.problem.addMotionTask(self._pose, 1.0, 1, 0.0)
         self._posture = tsid.TaskJointPosture("posture", self._robot)
-        self._posture.setKp(np.full(n, given["kp"]))
-        self._posture.setKd(np.full(n, given["kd"]))
+        self._posture.setKp(np.full(n, given["posture_kp"]))
+        self._posture.setKd(np.full(n, given["posture_kd"]))
         self.problem.addMotionTask(self._posture, float(given["posture_weight"]), 1, 0.0)
         # The constructor doubles the step, which is the paper's way to avoid chatter.
         self.bounds = tsid.TaskJointPosVelAccBounds(
@@ -91,7 +91,7 @@ class Placo:
         self._solver.dt = float(given["dt"])
         self._task = self._solver.add_joints_task()
         self._task.configure("joints", "soft", 1.0)
-        self._task.kp, self._task.kd = float(given["kp"]), float(given["kd"])
+        self._task.kp, self._task.kd = float(given["posture_kp"]), float(given["posture_kd"])
         for name, torque in zip(self._names, given["tau_max"], strict=True):
             self._solver.set_torque_limit(name, float(torque))
             self._solver.set_qdd_safe(name, float(given["a_max"]))
@@ -157,44 +157,6 @@ def answer(given: Arrays, _: str, urdf: Path) -> tuple[Arrays, Callable[[], Time
     return {"a": a, "tau": tau, "bounds": np.stack([lower, upper], axis=1)}, timed
 
 
-def bound(given: Arrays, *_: object) -> tuple[Arrays, Callable[[], Times]]:
-    """Give the bounds of equal joints in states q and v, for limits by name."""
-    from tsid import tsid_pywrap as tsid
-
-    found, tasks = {}, {}
-    for name in given["names"]:
-        q_min, q_max, v_max, a_max, dt = given[f"limits:{name}"]
-        states = given[f"states:{name}"]
-        model, parent, n = pin.Model(), 0, states.shape[2]
-        for j in range(n):
-            joint = pin.JointModelRZ()
-            parent = model.addJoint(parent, joint, pin.SE3.Identity(), f"joint_{j}")
-            model.appendBodyToJoint(parent, pin.Inertia.Random(), pin.SE3.Identity())
-        robot = tsid.RobotWrapper(model, tsid.RootJointType.FIXED_BASE_SYSTEM, False)
-        task = tsid.TaskJointPosVelAccBounds("bounds", robot, 0.5 * dt, False)
-        task.setPositionBounds(np.full(n, q_min), np.full(n, q_max))
-        task.setVelocityBounds(np.full(n, v_max))
-        task.setAccelerationBounds(np.full(n, a_max))
-        data = robot.data()
-        values = np.empty_like(states)
-        for i, (q, v) in enumerate(zip(*states, strict=True)):
-            constraint = task.compute(0.0, q, v, data)
-            values[:, i] = constraint.lowerBound, constraint.upperBound
-        found[str(name)] = values
-        tasks[str(name)] = task, data, robot, list(zip(*states, strict=True))
-
-    def timed() -> Times:
-        """Return microseconds of a call, its bounds read as arrays."""
-        task, data, _, pairs = tasks[str(given["names"][0])]
-        begin = time.thread_time()
-        for q, v in pairs:
-            constraint = task.compute(0.0, q, v, data)
-            constraint.lowerBound, constraint.upperBound  # noqa: B018
-        return (1e6 * (time.thread_time() - begin) / len(pairs),)
-
-    return found, timed
-
-
 def main() -> None:
     """Do the task, then time for as long as asked to."""
     source, target, task, name = sys.argv[1:]
@@ -202,8 +164,8 @@ def main() -> None:
         given = dict(content)
     with tempfile.TemporaryDirectory() as directory:
         urdf = Path(directory) / "arm.urdf"
-        urdf.write_text(str(given.get("urdf", "")))
-        work = {"rollout": roll_out, "step": answer, "bounds": bound}[task]
+        urdf.write_text(str(given["urdf"]))
+        work = {"rollout": roll_out, "step": answer}[task]
         found, timed = work(given, name, urdf)
     np.savez(target, **found)
     print("ready", flush=True)

@@ -21,7 +21,6 @@ from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot
 from torque_safety_controller.node import assembly
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.contact.interaction import Interaction
-from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.integral import FadingTorque, Integral
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.step import Step
@@ -51,8 +50,7 @@ class DirectLoop:
 
     Args:
         robot: name of a file in ``config/``.
-        changed: parameters that differ from it, by name; and `FRICTION`.
-        overlays: further files in ``config/``, whose values count more than the first one's.
+        changed: parameters that differ from it, by name.
 
     Attributes:
         robot: in PyBullet.
@@ -62,13 +60,8 @@ class DirectLoop:
         sensing: whether the force/torque sensor says anything.
     """
 
-    def __init__(
-        self,
-        robot: str,
-        changed: Mapping[str, Any] | None = None,
-        overlays: Sequence[str] = (),
-    ) -> None:
-        self._values = load_node_values(robot, *overlays)
+    def __init__(self, robot: str, changed: Mapping[str, Any] | None = None) -> None:
+        self._values = load_node_values(robot)
         self._changed = dict(changed or {})
         config = self._configuration("bullet_node", BulletConfiguration)
         self.robot = make_robot(config)
@@ -107,11 +100,6 @@ class DirectLoop:
         """Change live parameters of the controller, as a running node would."""
         self._changed |= parameters
         self.controller.configure(self._controller_configuration().settings)
-
-    def change_friction(self, **settings: Any) -> None:
-        """Change settings of the friction compensation, also those that are no parameters."""
-        friction = self.controller.find(Friction)
-        friction.settings = replace(friction.settings, **settings)
 
     @property
     def integral_budget(self) -> np.ndarray:

@@ -32,7 +32,6 @@ HEADS = (
     "limits",
 )
 
-DATA = "package://example-robot-data/robots/"
 BULLET = "pybullet_data:"
 
 
@@ -40,7 +39,7 @@ class Arm(NamedTuple):
     """An arm of an installed package.
 
     Attributes:
-        urdf: ``package://`` URI, or a file of pybullet_data.
+        urdf: file of example-robot-data, or of pybullet_data.
         tip: link or links at the end.
         base: link whose joints before are locked; empty for none.
     """
@@ -51,43 +50,35 @@ class Arm(NamedTuple):
 
 
 ARMS = {
-    "ur3": Arm(DATA + "ur_description/urdf/ur3_robot.urdf", "tool0"),
-    "ur5": Arm(DATA + "ur_description/urdf/ur5_robot.urdf", "tool0"),
-    "ur10": Arm(DATA + "ur_description/urdf/ur10_robot.urdf", "tool0"),
-    "ur5_limited": Arm(DATA + "ur_description/urdf/ur5_joint_limited_robot.urdf", "tool0"),
-    "kinova_j2s6s200": Arm(
-        DATA + "kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"
-    ),
+    "ur3": Arm("ur_description/urdf/ur3_robot.urdf", "tool0"),
+    "ur5": Arm("ur_description/urdf/ur5_robot.urdf", "tool0"),
+    "ur10": Arm("ur_description/urdf/ur10_robot.urdf", "tool0"),
+    "ur5_limited": Arm("ur_description/urdf/ur5_joint_limited_robot.urdf", "tool0"),
+    "kinova_j2s6s200": Arm("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
     "xarm6": Arm(BULLET + "xarm/xarm6_robot.urdf", "link6"),
-    "z1": Arm(DATA + "z1_description/urdf/z1.urdf", "link06"),
-    "xarm7": Arm(DATA + "xarm_description/urdf/xarm7.urdf", "link_eef"),
-    "panda": Arm(DATA + "panda_description/urdf/panda.urdf", "panda_hand"),
+    "z1": Arm("z1_description/urdf/z1.urdf", "link06"),
+    "xarm7": Arm("xarm_description/urdf/xarm7.urdf", "link_eef"),
+    "panda": Arm("panda_description/urdf/panda.urdf", "panda_hand"),
     "iiwa": Arm(BULLET + "kuka_iiwa/model.urdf", "lbr_iiwa_link_7"),
-    "baxter_right": Arm(DATA + "baxter_description/urdf/baxter.urdf", "right_gripper"),
+    "baxter_right": Arm("baxter_description/urdf/baxter.urdf", "right_gripper"),
     "tiago": Arm(
-        DATA + "tiago_description/robots/tiago_no_hand.urdf",
-        "wrist_ft_tool_link",
-        "torso_lift_link",
+        "tiago_description/robots/tiago_no_hand.urdf", "wrist_ft_tool_link", "torso_lift_link"
     ),
     "talos_right": Arm(
-        DATA + "talos_data/robots/talos_reduced.urdf", "gripper_right_base_link", "torso_2_link"
+        "talos_data/robots/talos_reduced.urdf", "gripper_right_base_link", "torso_2_link"
     ),
-    "pr2_left": Arm(
-        DATA + "pr2_description/urdf/pr2.urdf", "l_gripper_palm_link", "torso_lift_link"
-    ),
-    "g1_left": Arm(
-        DATA + "g1_description/urdf/g1_29dof_rev_1_0.urdf", "left_rubber_hand", "torso_link"
-    ),
-    "romeo_left": Arm(DATA + "romeo_description/urdf/romeo_small.urdf", "l_gripper", "torso"),
-    "centauro_left": Arm(DATA + "centauro_description/urdf/centauro.urdf", "arm1_8", "torso_2"),
-    "baxter_both": Arm(DATA + "baxter_description/urdf/baxter.urdf", "left_gripper,right_gripper"),
+    "pr2_left": Arm("pr2_description/urdf/pr2.urdf", "l_gripper_palm_link", "torso_lift_link"),
+    "g1_left": Arm("g1_description/urdf/g1_29dof_rev_1_0.urdf", "left_rubber_hand", "torso_link"),
+    "romeo_left": Arm("romeo_description/urdf/romeo_small.urdf", "l_gripper", "torso"),
+    "centauro_left": Arm("centauro_description/urdf/centauro.urdf", "arm1_8", "torso_2"),
+    "baxter_both": Arm("baxter_description/urdf/baxter.urdf", "left_gripper,right_gripper"),
     "tiago_dual": Arm(
-        DATA + "tiago_description/robots/tiago_dual.urdf",
+        "tiago_description/robots/tiago_dual.urdf",
         "hand_left_tool_link,hand_right_tool_link",
         "torso_lift_link",
     ),
     "tiago_pro_dual": Arm(
-        DATA + "tiago_pro_description/robots/tiago_pro.urdf",
+        "tiago_pro_description/robots/tiago_pro.urdf",
         "arm_left_tool_link,arm_right_tool_link",
         "torso_lift_link",
     ),
@@ -98,7 +89,7 @@ ARMS = {
 def urdf_of(arm: Arm) -> str:
     """Return where the URDF of an arm is."""
     if not arm.urdf.startswith(BULLET):
-        return arm.urdf
+        return f"package://example-robot-data/robots/{arm.urdf}"
     import pybullet_data
 
     return str(Path(pybullet_data.getDataPath()) / arm.urdf.removeprefix(BULLET))

@@ -15,7 +15,7 @@ Ratios compare programs that run in turns in one process. NAME --help lists opti
               stop (20 min)
   peers       limits kept beside TSID, placo and a clamp
   step        one controller step, part by part; with --tsid beside TSID's
-  bounds      acceleration bounds: one arm, and batches; with --tsid beside TSID's
+  bounds      acceleration bounds: one arm, and batches
 
 TSID and placo are installed into .venv-tsid and .venv-placo.
 USAGE

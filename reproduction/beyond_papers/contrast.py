@@ -41,7 +41,7 @@ def main() -> None:
         print(
             f"{title}: elbow {np.degrees(q[:, JOINT].max() - limit):+.2f} degrees past its limit"
         )
-    with closing(Camera(loop.robot, floor=0.0)) as camera:
+    with closing(Camera(loop.robot, 0.0)) as camera:
         frames = [
             _frame(camera, runs, limit, k)
             for k in [*range(round(BEGIN / loop.dt), len(t), every), len(t) - 1]

@@ -19,7 +19,6 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import cache
 from multiprocessing import get_context
 from typing import Any, NamedTuple
@@ -42,7 +41,7 @@ SETTLED = 5.0  # s after which the torque steps of such a goal count
 ON_ITS_WAY = 0.02  # rad that a joint moves afterwards; then they do not
 RISE = 0.2  # s
 UNUSED = ("acceleration_limits", "ft_wrench")
-HANDS = ("ideal", "ideal_remedies", "all")
+HANDS = ("ideal", "all")
 """Cases whose hand is looked at four times, not once."""
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """A posture task that drives each joint to its limits, whatever the hand does."""
@@ -76,15 +75,14 @@ Values = dict[str, dict[str, Any]]
 _held = ExitStack()
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """What is spoilt, and what is done about it.
 
     Attributes:
         title: of the row.
         spoilt: how many times the imperfections of the file are simulated: 0, 1 or 2.
-        overlay: nodes that get the file of the imperfect robot.
-        changed: parameters that differ, by node.
+        done: whether all that the file of the imperfect robot does about them is done,
+        changed: but for these parameters, by node.
         outages: whether all commands fail for up to 0.2 s, some 1.5 times a second.
         filtered: whether the safety filter is on, also where the file does without it.
         torque: share of the torque limits that the motors have.
@@ -92,8 +90,8 @@ class Case:
 
     title: str
     spoilt: int
-    overlay: tuple[str, ...] = ("bounds_node", "controller_node", "estimator_node")
-    changed: Mapping[str, Mapping[str, Any]] | None = None
+    done: bool = True
+    changed: Mapping[str, Mapping[str, Any]] = {}
     outages: bool = False
     filtered: bool = False
     torque: float = 1.0
@@ -108,36 +106,20 @@ NOTHING_DECLARED: dict[str, Any] = {
     "motor_bandwidth": [],
     "bounds_dt_factor": 2.0,
 }
+NO_PREDICTION = {"estimator_node": {"delay": 0, "motor_bandwidth": []}}
+NO_OBSERVER = {"estimator_node": {"velocity_estimation": False}}
+BRAKES = {"bullet_node": {"acceleration_min": [], "acceleration_max": []}}
 CASES = {
-    "ideal": Case("ideal", 0, ()),
-    # A delay that is declared is predicted, so that it must exist.
-    "ideal_remedies": Case(
-        "ideal, all done but prediction",
-        0,
-        changed={"estimator_node": {"delay": 0, "motor_bandwidth": []}},
-    ),
-    "nothing": Case("nothing done", 1, ()),
+    "ideal": Case("ideal", 0, done=False),
+    "nothing": Case("nothing done", 1, done=False),
     "no_margins": Case(
         "all but margins and horizon", 1, changed={"bounds_node": NOTHING_DECLARED}
     ),
-    "no_prediction": Case(
-        "all but prediction",
-        1,
-        changed={"estimator_node": {"delay": 0, "motor_bandwidth": []}},
-    ),
-    "no_observer": Case(
-        "all but the observer",
-        1,
-        changed={"estimator_node": {"velocity_estimation": False}},
-    ),
+    "no_prediction": Case("all but prediction", 1, changed=NO_PREDICTION),
+    "no_observer": Case("all but the observer", 1, changed=NO_OBSERVER),
     "all": Case("all done", 1),
     "twice": Case("twice as much as declared", 2),
-    "outage_brake": Case(
-        "commands fail for 0.2 s, brakes",
-        1,
-        changed={"bullet_node": {"acceleration_min": [], "acceleration_max": []}},
-        outages=True,
-    ),
+    "outage_brake": Case("commands fail for 0.2 s, brakes", 1, changed=BRAKES, outages=True),
     "outage_stop": Case("commands fail for 0.2 s, stop", 1, outages=True),
     "filter": Case("safety filter", 1, filtered=True),
     "filter_weak": Case("safety filter, 60% of its torque", 1, filtered=True, torque=0.6),
@@ -146,40 +128,24 @@ AT_LENGTH = ("all", "filter", "filter_weak")
 """Cases that are played for longer."""
 WITHIN_DECLARED = (*AT_LENGTH, "outage_stop")
 """Cases in which no limit may be passed: what is spoilt is within what is declared."""
-NOT_PLAYED = {
-    ("baxter_left_arm", "filter"),
-    ("baxter_left_arm", "filter_weak"),
-}
+NOT_PLAYED = {("baxter_left_arm", "filter"), ("baxter_left_arm", "filter_weak")}
 """Baxter has the filter in each case, and cannot hold itself with less torque."""
-DOUBLED = (
-    "encoder_resolution",
-    "position_noise",
-    "velocity_noise",
-    "state_delay",
-    "command_delay",
-    "torque_constant_error",
-    "torque_ripple",
-    "current_noise",
-    "missed_in_row",
-)
+DOUBLED = ("encoder_resolution", "position_noise", "velocity_noise", "torque_constant_error")
+DOUBLED += ("torque_ripple", "current_noise", "state_delay", "command_delay", "missed_in_row")
 HALVED = ("motor_bandwidth", "velocity_filter_hz")
+KNOWING = ("bounds_node", "controller_node", "estimator_node")
+"""Nodes that are told what is spoilt."""
 
 
-def scaled(imperfections: Mapping[str, Any], factor: float) -> dict[str, Any]:
+def scaled(imperfections: Mapping[str, Any], factor: int) -> dict[str, Any]:
     """Return imperfections that are `factor` times as bad."""
 
     def times(value: Any, by: float) -> Any:
-        if isinstance(value, list):
-            return [times(item, by) for item in value]
-        return round(value * by) if isinstance(value, int) else value * by
+        return [by * item for item in value] if isinstance(value, list) else by * value
 
     result = dict(imperfections)
-    for name in DOUBLED:
-        if name in result:
-            result[name] = times(result[name], factor)
-    for name in HALVED:
-        if name in result:
-            result[name] = times(result[name], 1.0 / factor)
+    for names, by in ((DOUBLED, factor), (HALVED, 1.0 / factor)):
+        result |= {name: times(result[name], by) for name in names if name in result}
     return result
 
 
@@ -188,7 +154,7 @@ def node_values(robot: str, case: Case, seed: int) -> Values:
     plain, imperfect = load_node_values(robot), load_node_values(robot, f"imperfect/{robot}")
     values: Values = {}
     for node, own in plain.items():
-        chosen = imperfect[node] if node in case.overlay else own
+        chosen = imperfect[node] if case.done and node in KNOWING else own
         if node == "bullet_node" and case.spoilt:
             chosen = own | scaled(
                 {k: v for k, v in imperfect[node].items() if own.get(k) != v}, case.spoilt
@@ -197,7 +163,7 @@ def node_values(robot: str, case: Case, seed: int) -> Values:
                 rate = chosen["rate_hz"]
                 chosen |= {"outage_probability": 1.5 / rate, "outage_longest": round(0.2 * rate)}
         of_robot = {name: imperfect[node][name] for name in OF_ROBOT if name in imperfect[node]}
-        changed = dict((case.changed or {}).get(node, {}))
+        changed = dict(case.changed.get(node, {}))
         values[node] = chosen | of_robot | changed
         if case.filtered and node == "controller_node":
             values[node] |= {"safety_filter": True}
@@ -428,7 +394,7 @@ def write_page(rows: Mapping[tuple[str, str], Row]) -> None:
 
 def color_of(name: str) -> str:
     """Return the color of a case: grey, nothing spoilt; green, as declared; orange, beyond it."""
-    if name.startswith("ideal"):
+    if name == "ideal":
         return "tab:gray"
     if name in WITHIN_DECLARED:
         return "tab:green"

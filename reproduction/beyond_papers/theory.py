@@ -14,12 +14,7 @@ from contextlib import closing
 import matplotlib.pyplot as plt
 import numpy as np
 from chain import ROOT, load_node_values
-from compliance_push import ELBOW_FORCE, MODES
-from compliance_push import push as push_elbow
-from direct import column, distance, hand_errors
 from figure import Figure, reproduce
-from paper1_integral import ELBOW, PAPER, PUSHES, UNLIMITED
-from paper1_integral import push as push_hand
 
 from viability_bounds_pkg import viability
 from viability_bounds_pkg.baselines import naive_bounds
@@ -32,7 +27,7 @@ sys.path.insert(0, f"{ROOT}/src/sim_bridge/test/support")
 from stopped_robot import Stopped
 
 ROBOTS = {"Panda": "panda", "TALOS": "talos_left_arm", "Baxter": "baxter_left_arm"}
-RED, GREEN, GREY = "tab:red", "tab:green", "tab:gray"
+RED, GREEN = "tab:red", "tab:green"
 HEADS = ("what", "here", "")
 
 
@@ -81,67 +76,6 @@ def bounds() -> Figure:
         so="kept",
     )
     figure.save(picture, "bounds")
-    return figure
-
-
-def integral_action() -> Figure:
-    """TALOS' hand, pushed for 5 s and let go, without anti-windup and with it."""
-    figure = Figure("theory-integral", heads=HEADS)
-    picture, axes = plt.subplots(1, 2, figsize=(10, 3.7), layout="constrained")
-    overshoot = {}
-    for name, changed, color in (
-        ("without anti-windup", UNLIMITED, RED),
-        ("with anti-windup", PAPER, GREEN),
-    ):
-        run = push_hand(changed, PUSHES[1])
-        samples = run["samples"]
-        t = column(samples, "t") - samples[0].t
-        share = column(samples, "additional")[:, ELBOW] / run["loop"].integral_budget[ELBOW]
-        far = 1e3 * distance(samples)
-        figure.data[name] = np.column_stack([t, share, far])
-        overshoot[name] = 1e3 * run["overshoot"]
-        axes[0].plot(t, share, color=color, label=name)
-        axes[1].plot(t, far, color=color, label=name)
-    axes[0].axhspan(-1.0, 1.0, color=GREY, alpha=0.15, lw=0, label="the budget")
-    axes[0].set(ylabel="integral torque of the elbow, in budgets")
-    axes[1].set(ylabel="hand off its goal, mm")
-    for axis in axes:
-        axis.axvline(5.0, color="k", ls="--", lw=1)
-        axis.set(xlabel="time, s; let go at 5 s", xlim=(0.0, 9.0))
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=9)
-    text = ", ".join(f"{name} {value:.1f} mm" for name, value in overshoot.items())
-    without, with_it = overshoot.values()
-    figure.add("overshoot of the hand when let go", text, holds=with_it < without, so="less")
-    figure.save(picture, "integral_action")
-    return figure
-
-
-def nullspace() -> Figure:
-    """TALOS' elbow, pushed to and fro, stiff in all joints and in the hand's pose only."""
-    figure = Figure("theory-nullspace", heads=HEADS)
-    picture, axes = plt.subplots(1, 2, figsize=(10, 3.7), layout="constrained")
-    moved = {}
-    for (name, changed), color in zip(MODES.items(), (RED, GREEN), strict=True):
-        run = push_elbow(changed, hand=0.0)
-        joint = run.loop.config.joints.index("arm_left_5_joint")
-        angle, place = run.angles[:, joint], 1e3 * hand_errors(run.samples)[0]
-        figure.data[name] = np.column_stack([run.t, angle, place])
-        moved[name] = float(np.abs(angle).max())
-        axes[0].plot(run.t, angle, color=color, label=name)
-        axes[1].plot(run.t, place, color=color, label=name)
-    for axis in axes:
-        for each in run.pushes:
-            axis.axvspan(each.begin, each.end, color="tab:orange", alpha=0.12, lw=0)
-        axis.set(xlabel=f"time, s; shaded: elbow pushed with {ELBOW_FORCE:.0f} N")
-        axis.grid(alpha=0.3)
-    axes[0].set(ylabel="arm_left_5_joint moves by, rad")
-    axes[1].set(ylabel="hand off its goal, mm", ylim=(0.0, 3.0))
-    axes[1].legend(fontsize=9)
-    text = ", ".join(f"{name} {value:.3f} rad" for name, value in moved.items())
-    without, with_it = moved.values()
-    figure.add("a joint moves", text, holds=with_it > 3.0 * without, so="easier")
-    figure.save(picture, "nullspace")
     return figure
 
 
@@ -289,8 +223,6 @@ def estimator() -> Figure:
 
 PARTS: dict[str, Callable[[], Figure]] = {
     "bounds": bounds,
-    "integral_action": integral_action,
-    "nullspace": nullspace,
     "stopping": stopping,
     "estimator": estimator,
 }

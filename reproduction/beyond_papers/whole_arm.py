@@ -20,7 +20,7 @@ import os
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -43,17 +43,10 @@ POSTURE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose
 POSE: dict[str, Any] = {"pose_kp": 100.0, "pose_kd": 20.0, "posture_kp": 10.0, "posture_kd": -1.0}
 POSE |= {"pose_weight": 1.0, "posture_weight": 1e-5, "pose_error": "logarithm"}
 """Gains on the way to poses; damping of the posture is critical. The logarithm for all arms."""
-AGAINST_FRICTION = {
+OWN = {"pose_kp": 900.0, "pose_kd": 50.0, "posture_kp": 0.0, "posture_kd": 5.0}
+AGAINST_FRICTION: dict[str, dict[str, Any]] = {
     "posture": POSTURE | {"posture_kp": 900.0, "posture_kd": 50.0, "friction_compensation": 0.9},
-    "pose": {
-        "pose_kp": 900.0,
-        "pose_kd": 50.0,
-        "posture_kp": 0.0,
-        "posture_kd": 5.0,
-        "pose_weight": 1.0,
-        "posture_weight": 1e-3,
-        "friction_compensation": 0.9,
-    },
+    "pose": OWN | {"pose_weight": 1.0, "posture_weight": 1e-3, "friction_compensation": 0.9},
 }
 """TALOS': those of its file, the joints as stiff as the hand. Its integral action alone ends in
 stick-slip, 2 mrad to and fro, and what pulls at the null space sticks and slips as well."""
@@ -70,26 +63,6 @@ STILL, REST = 0.01, 0.3
 SHOULDER, ELBOW = 1, 3
 
 
-class Case(NamedTuple):
-    """A row of the table.
-
-    Attributes:
-        robot: its file.
-        share: of its torque limits.
-        changed: what differs from its file.
-    """
-
-    robot: str
-    share: float = 1.0
-    changed: dict[str, Any] = {}
-
-    @property
-    def filtered(self) -> bool:
-        """Whether the safety filter is on."""
-        return bool(self.changed.get("safety_filter", True))
-
-
-WITHOUT = {"safety_filter": False}
 ARMS = {
     "Baxter": ("baxter_left_arm", 1.0),
     "Panda": ("panda", 1.0),
@@ -97,17 +70,19 @@ ARMS = {
     "Panda, 60% of its torque": ("panda", 0.6),
     "TALOS, 60% of its torque": ("talos_left_arm", 0.6),
 }
-CASES: dict[str, Case] = {}
-for _arm, (_robot, _share) in ARMS.items():
-    CASES[_arm] = Case(_robot, _share)
-    CASES[f"{_arm}, without"] = Case(_robot, _share, WITHOUT)
+"""Files, and the share of the torque limits that is left."""
+CASES = {
+    arm + ("" if filtered else ", without"): (*own, filtered)
+    for arm, own in ARMS.items()
+    for filtered in (True, False)
+}
 
 
-def make_loop(case: Case) -> DirectLoop:
+def make_loop(robot: str, share: float, filtered: bool) -> DirectLoop:
     """Return the arm of a case."""
-    tau_max = DirectLoop(case.robot).config.torque_max
-    own = {"safety_filter": True, "torque_max": (case.share * tau_max).tolist()}
-    return DirectLoop(case.robot, POSTURE | own | case.changed)
+    tau_max = DirectLoop(robot).config.torque_max
+    own = {"safety_filter": filtered, "torque_max": (share * tau_max).tolist()}
+    return DirectLoop(robot, POSTURE | own)
 
 
 def random_goal(loop: DirectLoop, rng: np.random.Generator, at_limits: float = 0.5) -> np.ndarray:
@@ -146,11 +121,8 @@ def visit(loop: DirectLoop, goals: str, posture: np.ndarray, limit: float) -> No
 
 def play(name: str, seed: int, limit: float, duration: float = 60.0) -> dict[str, Any]:
     """Play random goals for a minute; return violations and what the filter did."""
-    case = CASES[name]
-    loop, rng = make_loop(case), np.random.default_rng(seed)
-    gains = {"posture": POSTURE, "pose": POSE}
-    if case.robot == "talos_left_arm":
-        gains = AGAINST_FRICTION
+    loop, rng = make_loop(*CASES[name]), np.random.default_rng(seed)
+    gains = AGAINST_FRICTION if "TALOS" in name else {"posture": POSTURE, "pose": POSE}
     while loop.t < duration:
         for goals, own in gains.items():
             loop.change(**own)
@@ -171,7 +143,7 @@ def compare(figure: Figure, minutes: int, limit: float, word: str) -> None:
         runs = {
             name: [
                 pool.submit(play, name, seed, limit)
-                for seed in range(minutes if CASES[name].filtered else min(minutes, SHORT))
+                for seed in range(minutes if CASES[name][-1] else min(minutes, SHORT))
             ]
             for name in names
         }
@@ -187,7 +159,7 @@ def add_row(figure: Figure, name: str, minutes: list[dict[str, Any]]) -> None:
     )
     outcomes: Counter[str] = sum((Counter(minute["outcomes"]) for minute in minutes), Counter())
     fine = position == 0.0 and speed == 0.0 and torque <= 1.0 + 1e-9
-    filtered = CASES[name].filtered
+    filtered = CASES[name][-1]
     share = 1.0 - outcomes["as wanted"] / max(outcomes.total(), 1)
     figure.metrics |= {f"{name}: position": position, f"{name}: speed": speed}
     figure.add(
@@ -211,8 +183,7 @@ def shoulder(axis: plt.Axes, seed: int = 4) -> None:
             ends = np.where(rng.random(low.size) < 0.5, low, high)
             goal = np.where(rng.random(low.size) < 0.5, ends, rng.uniform(low, high))
             loop.controller.goals.set_posture(goal)
-            samples = loop.run(3.0)
-        del samples
+            loop.run(3.0)
         t = np.arange(len(loop.samples)) * loop.dt
         q = column(tuple(loop.samples), "q")[:, SHOULDER]
         axis.plot(t, q, color=colour, label=f"{label} the filter")

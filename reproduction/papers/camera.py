@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from xml.etree.ElementTree import fromstring, tostring
 
 import numpy as np
@@ -36,22 +36,12 @@ class Camera:
     The robot's world is not changed. Call `close` after use; `contextlib.closing` does.
 
     Args:
-        robot: its present state and obstacles are rendered.
-        floor: height of a floor plate, m; none by default.
-        colors: red, green, blue, 0 to 1, of obstacles, by name.
-
-    Raises:
-        RobotDescriptionError: a mesh cannot be found.
+        robot: its obstacles are rendered.
+        floor: height of a floor plate, m.
     """
 
-    def __init__(
-        self,
-        robot: BulletRobot,
-        *,
-        floor: float | None = None,
-        colors: Mapping[str, Sequence[float]] | None = None,
-    ) -> None:
-        self._robot, self._colors = robot, dict(colors or {})
+    def __init__(self, robot: BulletRobot, floor: float) -> None:
+        self._robot = robot
         urdf, _, _ = robot.description
         self._bullet = bullet = BulletClient()
         with silenced(1), silenced(2):
@@ -64,18 +54,16 @@ class Camera:
             # Mirrored meshes would be seen from inside.
             bullet.changeVisualShape(body, shape[1], flags=pybullet.VISUAL_SHAPE_DOUBLE_SIDED)
         self._shown: list[int] = []  # bodies of the obstacles in the last picture
-        if floor is not None:
-            plate = Obstacle("floor", "box", [3.0, 3.0, 0.04], [0.0, 0.0, floor - 0.02])
-            self._add_body(plate, _FLOOR_COLOR)
+        plate = Obstacle("floor", "box", [3.0, 3.0, 0.04], [0.0, 0.0, floor - 0.02])
+        self._add_body(plate, _FLOOR_COLOR)
 
     def snapshot(
         self,
         eye: ArrayLike,
         target: ArrayLike,
-        size: tuple[int, int] = (800, 600),
-        *,
-        q: ArrayLike | None = None,
-        angle: float = 40.0,
+        size: tuple[int, int],
+        q: ArrayLike,
+        angle: float,
     ) -> NDArray[np.uint8]:
         """Render a picture.
 
@@ -83,22 +71,21 @@ class Camera:
             eye: position of the camera in the frame of the robot's root link, shape (3,), m.
             target: point in the middle of the picture, shape (3,), m.
             size: width and height, pixels.
-            q: positions of the joints, shape (n,), rad; those of the robot by default.
+            q: positions of the joints, shape (n,), rad.
             angle: vertical field of view, degrees.
 
         Returns:
             Red, green and blue, shape (height, width, 3), uint8.
         """
         bullet = self._bullet
-        joints = self._robot.state().q if q is None else q
-        positions = finite_vector("q", joints, len(self._joints)).tolist()
+        positions = finite_vector("q", q, len(self._joints)).tolist()
         for joint, position in zip(self._joints, positions, strict=True):
             bullet.resetJointState(self._body, joint, position)
         for shown in self._shown:
             bullet.removeBody(shown)
         self._shown = [
-            self._add_body(obstacle, self._colors.get(name, _OBSTACLE_COLOR))
-            for name, obstacle in self._robot.obstacles.present.items()
+            self._add_body(obstacle, _OBSTACLE_COLOR)
+            for obstacle in self._robot.obstacles.present.values()
         ]
         eye, target = finite_vector("eye", eye, 3), finite_vector("target", target, 3)
         width, height = (_OVERSAMPLING * pixels for pixels in size)

@@ -35,7 +35,6 @@ def _pole(name: str, along: str, centre: tuple[float, float, float], length: flo
     turned = {
         "x": (0.0, _SIDE, 0.0, _SIDE),
         "y": (_SIDE, 0.0, 0.0, _SIDE),
-        "z": (0.0, 0.0, 0.0, 1.0),
     }
     return Obstacle(name, "cylinder", (0.04, 0.04, length), centre, turned[along])
 
@@ -45,8 +44,6 @@ POLES = (
     _pole("upper pole", "x", (0.40, 0.36, 0.44), 0.25),
     _pole("lower pole", "y", (0.42, 0.0, 0.28), 0.2),
 )
-# Little room in the null space: a joint of the wrist reaches its limit.
-UPRIGHT = _pole("upright pole", "z", (0.40, 0.40, 0.5), 1.2)
 
 
 class Drawn(NamedTuple):
@@ -179,21 +176,6 @@ def figure_10() -> Figure:
     return figure
 
 
-def adverse() -> Figure:
-    """A pole to which the null space cannot yield."""
-    figure = Figure("paper1-adverse-pole", PART, HEADS)
-    found = [judge(draw(changed, [UPRIGHT], 2)) for changed in MODES.values()]
-    figure.add(
-        "An upright pole at the left, where the null space has little room, 2 turns",
-        "-",
-        *(_told(each) for each in found),
-        holds=all(each["within_limits"] for each in found),
-        so="for comparison: the null space cannot yield to every pole",
-    )
-    figure.save()
-    return figure
-
-
 def _told(found: dict[str, float]) -> str:
     """Return what a run amounts to, in words."""
     limits = "" if found["within_limits"] else ", a limit BROKEN"
@@ -202,33 +184,20 @@ def _told(found: dict[str, float]) -> str:
 
 
 def _picture(free: Mapping[str, Drawn], poles: Mapping[str, Drawn]) -> plt.Figure:
-    picture, axes = plt.subplots(4, 2, figsize=(13, 12), layout="constrained")
-    for column_of, name in zip(axes.T, MODES, strict=True):
-        runs = {"free": (free[name], "tab:green"), "among poles": (poles[name], "tab:red")}
-        plane, path, error, force = column_of
-        goals = free[name].goals
-        plane.plot(goals[:, 1], goals[:, 2], "k--", label="reference")
-        for k, label in ((1, "y"), (2, "z")):
-            path.plot(free[name].t, goals[:, k], "k--", label="reference" if k == 1 else None)
-            color = "tab:blue" if k == 1 else "tab:orange"
-            run = poles[name]
-            path.plot(run.t, run.places[:, k], color=color, label=f"{label}, among poles")
-        for kind, (run, color) in runs.items():
-            plane.plot(run.places[:, 1], run.places[:, 2], color=color, label=kind, lw=1)
+    """Draw the way of the hand in the plane, its error, and the force of the poles."""
+    picture, axes = plt.subplots(3, 2, figsize=(13, 10), layout="constrained")
+    for (plane, error, force), name in zip(axes.T, MODES, strict=True):
+        plane.plot(*free[name].goals[:, 1:].T, "k--", label="reference")
+        for label, run in (("free", free[name]), ("among poles", poles[name])):
             off_goal = 1e3 * np.linalg.norm(run.places - run.goals, axis=1)
-            error.semilogy(run.t, np.maximum(off_goal, 1e-2), color=color, label=kind, lw=1)
+            plane.plot(*run.places[:, 1:].T, label=label, lw=1)
+            error.semilogy(run.t, np.maximum(off_goal, 1e-2), label=label, lw=1)
+            force.plot(run.t, run.forces, label=label, lw=1)
         error.axhline(20.0, color="black", linestyle=":", label="2 cm")
-        force.plot(poles[name].t, poles[name].forces, color="tab:red", lw=1)
-        for axis in (path, error, force):
-            for k in np.flatnonzero(np.diff(free[name].turn)):
-                axis.axvline(free[name].t[k], color="gray", linestyle="--", lw=1)
         plane.set(xlabel="y [m]", ylabel="z [m]", title=name, aspect="equal")
-        path.set(xlabel="time [s]; dashed: turns", ylabel="hand, y and z [m]")
         error.set(xlabel="time [s]", ylabel="hand off its reference [mm]", ylim=(1e-2, 300.0))
-        top = max(run.forces.max() for run in poles.values())
-        force.set(xlabel="time [s]", ylabel="poles press with [N]", ylim=(0.0, 1.05 * top))
-        for axis in column_of[:3]:
+        force.set(xlabel="time [s]", ylabel="poles press with [N]")
+        for axis in (plane, error, force):
             axis.legend(loc="upper right", fontsize="small")
-        for axis in column_of[1:]:
             axis.grid(alpha=0.3)
     return picture

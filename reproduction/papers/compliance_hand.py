@@ -182,30 +182,21 @@ def figure_9() -> Figure:
 
 def _draw_dual(led: Led, pushes: list[tuple[float, float, str, np.ndarray]]) -> plt.Figure:
     picture, axes = plt.subplots(3, 1, figsize=(9, 7), sharex=True, layout="constrained")
-    for axis in axes:
-        for begin, end, link, _ in pushes:
-            axis.axvspan(
-                begin, end, color="tab:orange" if link == HAND else "0.85", alpha=0.4, lw=0
-            )
-    for column, name in enumerate("xyz"):
-        axes[0].plot(led.t, 1e3 * led.place[:, column], label=name)
+    axes[0].plot(led.t, 1e3 * led.place, label=list("xyz"))
     axes[0].set_ylabel("hand, from its start [mm]")
-    axes[0].legend(loc="upper left", ncols=3)
     moved = led.joints - led.joints[0]
-    most = np.abs(moved).max(axis=0).argsort()[-3:]
-    for joint in most:
+    for joint in np.abs(moved).max(axis=0).argsort()[-3:]:
         axes[1].plot(led.t, moved[:, joint], label=led.loop.config.joints[joint])
     axes[1].set_ylabel("joints that move most [rad]")
-    axes[1].legend(loc="upper left")
     axes[2].plot(led.t, led.force, label="measured at the hand", lw=0.8)
-    yielding = np.array([state == "yielding" for state in led.state])
-    axes[2].fill_between(
-        led.t, 0.0, 22.0, where=yielding, color="tab:green", alpha=0.25, label="the hand yields"
-    )
     axes[2].axhline(10.0, color="0.4", ls=":", label="threshold")
     axes[2].set_ylabel("force [N]")
-    axes[2].set_xlabel("time [s]      grey: elbow pushed, orange: hand pulled")
-    axes[2].legend(loc="upper left")
+    axes[2].set_xlabel("time [s]; grey: elbow pushed, orange: hand pulled")
+    for axis in axes:
+        axis.legend(loc="upper left")
+        for begin, end, link, _ in pushes:
+            color = "tab:orange" if link == HAND else "0.85"
+            axis.axvspan(begin, end, color=color, alpha=0.4, lw=0)
     return picture
 
 
@@ -321,23 +312,5 @@ def pressing() -> Figure:
                 "within 5 %, 2 N" if holds else "not held: friction",
             )
         )
-    figure.save(_draw_press(runs))
+    figure.save()
     return figure
-
-
-def _draw_press(runs: Mapping[str, Pressed]) -> plt.Figure:
-    picture, axes = plt.subplots(
-        3, 1, figsize=(9, 7), sharex=True, layout="constrained", height_ratios=(2, 2, 1)
-    )
-    for axis, (name, run) in zip(axes, runs.items(), strict=False):
-        axis.plot(run.t, run.force[:, 2], label="table on hand, normal", lw=0.8)
-        axis.plot(run.t, run.measured, label="as the controller sees it", lw=0.8)
-        axis.plot(run.t, np.hypot(*run.force[:, :2].T), label="friction", lw=0.8)
-        axis.axhline(FORCE, color="0.4", ls=":")
-        axis.set(ylabel="force [N]", ylim=(-4.0, 25.0), title=name)
-        axes[2].plot(run.t, 1e3 * run.place[:, 1], label=f"{name.split(',')[0]}, along the table")
-    axes[0].legend(loc="upper left")
-    axes[2].set_ylabel("hand [mm]")
-    axes[2].set_xlabel("time [s]")
-    axes[2].legend()
-    return picture

@@ -210,31 +210,25 @@ def figure_6() -> Figure:
         holds=with_it["steady_m"] <= lacking["steady_m"],
         so="stiffness not lower",
     )
-    figure.save(_picture(int(with_it["witness_joint"])))
+    figure.save(_picture(int(with_it["witness_joint"])), "nullspace")
     return figure
 
 
 def _picture(witness: int) -> plt.Figure:
-    picture, axes = plt.subplots(2, 1, figsize=(12, 8), sharex=True, layout="constrained")
-    top = 1.25 * max(np.abs(run.angles[:, witness]).max() for run in runs().values())
-    for axis, (name, run) in zip(axes, runs().items(), strict=True):
-        turned = run.loop.controller.goals.pose_des.rotation
-        error = 1e3 * column(run.samples, "error")[:, :3] @ turned.T
-        for k, color in enumerate(("tab:red", "tab:green", "tab:blue")):
-            axis.plot(run.t, error[:, k], color=color, lw=1, label=f"hand, {'xyz'[k]}")
-        for each in run.pushes:
-            elbow = each.link == ELBOW
-            axis.axvspan(each.begin, each.end, color="orange" if elbow else "gray", alpha=0.15)
-            text = f"{each.name}\n{np.linalg.norm(each.force):.0f} N"
-            where = 0.5 * (each.begin + each.end)
-            axis.text(where, 4.9, text, ha="center", va="top", fontsize="small")
-        axis.set(ylabel="error of the hand [mm]", ylim=(-5.0, 5.0), title=name)
+    """Draw the joint that moves most, and the hand, while the elbow is pushed to and fro."""
+    picture, axes = plt.subplots(1, 2, figsize=(10, 3.7), layout="constrained")
+    for (name, run), color in zip(runs().items(), ("tab:red", "tab:green"), strict=True):
+        pushes = run.named("elbow")
+        begin = run.during(pushes[0]).start - round(0.5 / run.loop.dt)
+        t, angle = run.t[begin:], run.angles[begin:, witness]
+        axes[0].plot(t, angle - angle[0], color=color, label=name)
+        axes[1].plot(t, 1e3 * hand_errors(run.samples)[0][begin:], color=color, label=name)
+    for axis in axes:
+        for each in pushes:
+            axis.axvspan(each.begin, each.end, color="tab:orange", alpha=0.12, lw=0)
+        axis.set(xlabel=f"time, s; shaded: elbow pushed with {ELBOW_FORCE:.0f} N")
         axis.grid(alpha=0.3)
-        right = axis.twinx()
-        joint = run.loop.config.joints[witness]
-        right.plot(run.t, run.angles[:, witness], color="black", lw=2, label=f"{joint} (right)")
-        right.set(ylabel="angle of the witness joint [rad]", ylim=(-top, top))
-        lines = [*axis.get_lines(), *right.get_lines()]
-        axis.legend(lines, [line.get_label() for line in lines], loc="lower left", ncols=4)
-    axes[-1].set_xlabel("time [s]; gray: hand pushed, orange: elbow pushed")
+    axes[0].set(ylabel=f"{run.loop.config.joints[witness]} moves by, rad")
+    axes[1].set(ylabel="hand off its goal, mm", ylim=(0.0, 3.0))
+    axes[1].legend(fontsize=9)
     return picture

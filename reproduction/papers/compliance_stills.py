@@ -67,7 +67,7 @@ def figures_7_and_8() -> Figure:
             f"pushed back, {np.linalg.norm(back.force):.0f} N": run.during(back).stop - 1,
         }
         before = _elbow(run, run.samples[run.during(there).start].q)
-        with closing(Camera(run.loop.robot, floor=FLOOR)) as camera:
+        with closing(Camera(run.loop.robot, FLOOR)) as camera:
             for axis, (title, k), each in zip(
                 row, steps.items(), (None, there, None, back), strict=True
             ):
@@ -100,7 +100,7 @@ def figure_10_stills() -> Figure:
             inside = np.where(run.turn == turn, run.forces, -1.0)
             moments.append(int(inside.argmax()))
         path = np.array([view.pixel(place) for place in run.goals[::100]])
-        with closing(Camera(run.loop.robot, floor=FLOOR)) as camera:
+        with closing(Camera(run.loop.robot, FLOOR)) as camera:
             for axis, k in zip(row, moments, strict=True):
                 image = camera.snapshot(
                     view.eye, view.target, view.size, q=run.samples[k].q, angle=view.angle

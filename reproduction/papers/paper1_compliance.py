@@ -11,7 +11,7 @@ is compared is its integral action ``joints`` with ``task``; all else is the sam
 
 from __future__ import annotations
 
-from compliance_curve import adverse, figure_10
+from compliance_curve import figure_10
 from compliance_hand import figure_9, pressing
 from compliance_push import figure_6
 from compliance_stills import figure_10_stills, figures_7_and_8
@@ -26,7 +26,6 @@ PARTS = {
     "fig9": figure_9,
     "fig10": figure_10,
     "stills": figure_10_stills,
-    "adverse": adverse,
     "press": pressing,
 }
 

@@ -16,8 +16,8 @@ BROKEN = Minute(position=0.0, speed=1e-3, torque=0.8, step_at_rest=0.04)
 def test_each_case_differs_as_its_title_says(robot):
     values = {name: node_values(robot, case, seed=3) for name, case in CASES.items()}
     robots = {name: each["bullet_node"] for name, each in values.items()}
-    for name in ("ideal", "ideal_remedies"):
-        assert not robots[name].get("encoder_resolution") and not robots[name].get("state_delay")
+    ideal = robots["ideal"]
+    assert not ideal.get("encoder_resolution") and not ideal.get("state_delay")
     assert robots["all"]["imperfection_seed"] == 3
     once, twice = (robots[name] for name in ("all", "twice"))
     for name, factor in {"encoder_resolution": 2.0, "motor_bandwidth": 0.5}.items():

@@ -38,7 +38,7 @@ def test_it_fails_where_a_limit_was_passed_or_the_arm_stands(monkeypatch, passed
         def start(self, *_):
             pass
 
-        let_go = close = start
+        begin = close = start
 
         def run(self, name):
             return Round(name, passed, again)
