@@ -49,7 +49,7 @@ def test_at_rest_under_half_its_stiction_nothing_creeps():
     q = TALOS["start_positions"]
     with configured("talos_left_arm") as pair:
         pair.robot.reset(q, np.zeros(N))
-        pair.robot.step(pair.gravity() + load, 3000)
+        pair.robot.step(pair.gravity() + load, 1000)
         np.testing.assert_allclose(pair.robot.state().q, q, rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(pair.robot.state().v, 0.0, atol=1e-12)
 
@@ -68,18 +68,6 @@ def test_it_breaks_loose_above_its_stiction_only(rotor):
         robot.step([2.0], 100)  # less than the stiction, more than it takes now
         a = (robot.state().v[0] - v) / (100 * H)
         assert a == pytest.approx((2.0 - 1.0) / (INERTIA + rotor), rel=1e-9)
-
-
-def test_friction_at_speed_follows_stribecks_curve():
-    with single_joint(
-        friction_coulomb=1.0, friction_static=3.0, friction_viscous=0.4, stribeck_velocity=0.05
-    ) as robot:
-        for v in (0.02, 0.05, 0.1, 0.7, -0.05, -0.3):
-            robot.reset([0.0], [v])
-            robot.step([0.0])
-            end = robot.state().v[0]
-            dry = np.sign(v) * (1.0 + 2.0 * np.exp(-((v / 0.05) ** 2)))
-            assert INERTIA * (end - v) / H == pytest.approx(-dry - 0.4 * end, rel=1e-9)
 
 
 def test_coulomb_and_viscous_friction_stop_a_joint_as_the_analytic_solution():

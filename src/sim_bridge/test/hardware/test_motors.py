@@ -113,9 +113,3 @@ def test_the_robot_moves_by_the_true_torque_and_reports_the_believed_one(pair):
         np.testing.assert_allclose((after.v - before.v) / H, a, atol=1e-9 * np.abs(a).max())
         most = np.maximum(most, np.abs(after.motor_torque) / TORQUE_MAX)
     np.testing.assert_array_equal(robot.monitor.max_torque_ratio, most)
-
-
-def test_the_drives_hold_a_position_with_such_motors(pair):
-    pair.robot.move(Q + 0.05, ZERO, TORQUE_MAX, np.ones(N), 1000)
-    np.testing.assert_allclose(pair.robot.state().q, Q + 0.05, atol=2e-3)
-    assert (pair.robot.monitor.max_torque_ratio <= 1.0).all()

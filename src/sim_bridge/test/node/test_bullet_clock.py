@@ -106,7 +106,7 @@ def test_when_commands_fail_it_stops_within_its_limits_and_goes_on_when_they_ret
 
 def test_periods_in_which_it_was_late_itself_are_counted(ros):
     robot = RobotProbe(ros, clock="real_time", rate_hz=100.0)
-    before = int(robot.reported_now("late_periods"))
+    before = int(ros.wait_until(lambda: robot.reported("late_periods")))
     end = time.monotonic() + 0.1
     while time.monotonic() < end:
         pass  # as another callback of its process would

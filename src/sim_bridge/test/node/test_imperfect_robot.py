@@ -93,7 +93,7 @@ def test_readings_are_what_the_parts_make_of_the_true_motion_bit_for_bit(ros, gi
     rows, missed, braked = expected(commands, **given)
     for _ in range(2):  # the second time after a reset
         np.testing.assert_array_equal(play(robot, commands), rows)
-        robot.await_reported("missed_deadlines_injected", str(missed))
+        assert robot.reported_now("missed_deadlines_injected") == str(missed)
         assert robot.reported("deadline_misses") == "0"
         assert robot.reported("commands_refused") == "none"
         assert robot.reported("imperfections") == names

@@ -7,7 +7,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rclpy.serialization import serialize_message
@@ -28,11 +28,9 @@ def filled():
     status.values = [KeyValue(key="k", value="v")]
     pose = PoseWithCovarianceStamped()
     pose.pose.covariance = np.arange(36.0)
-    wrench = WrenchStamped()
-    wrench.wrench.torque.z = 4.5
     markers = MarkerArray(markers=[Marker(ns="wall", type=Marker.CUBE)])
     text = String(data="x" * 999)
-    return [state, limits, DiagnosticArray(status=[status]), pose, wrench, markers, text]
+    return [state, limits, DiagnosticArray(status=[status]), pose, markers, text]
 
 
 def equal(ours, read):

@@ -95,9 +95,10 @@ class RobotProbe:
         return self.ros.reported("bullet_node", key)
 
     def reported_now(self, key):
-        """Return a value of diagnostics that are yet to come."""
+        """Return a value of the diagnostics of the period that the last state begins."""
         self.ros.diagnostics.clear()
-        return self.ros.wait_until(lambda: self.reported(key), key)
+        self.await_reported("stamp_ns", str(self.stamp))
+        return self.reported(key)
 
     def await_reported(self, key, value):
         self.ros.wait_until(lambda: self.reported(key) == value, f"{key} {value}")
