@@ -62,6 +62,9 @@ _SHORTER = (
 )
 """How allowed values are said in fewer words; what a table's head says already is left out."""
 
+_IF_EMPTY = re.compile(r"(.+); (\S+) if empty")
+"""Descriptions whose end belongs into the column of defaults."""
+
 _BREAK = "<wbr>"
 """Where a long name may be broken."""
 
@@ -78,7 +81,7 @@ def parameters_page() -> str:
 `ros2 param describe NODE PARAMETER` shows the same.
 
 - *double[]*: where no other length is given, one number for each joint, in the order of `joints`.
-  An array whose default is empty may be left out.
+  An array with a default may be left out or empty.
 - *Live*: can change while the node runs. All others are read-only.
 - At start a wrong value or an unknown name stops the node with one line, which says what is
   allowed. While it runs the value is refused, and the old one stays.
@@ -213,8 +216,10 @@ def _nodes(nodes: Sequence[str]) -> str:
 
 
 def _cells(row: Parameter) -> tuple[str, ...]:
-    kind = f"{_TYPES[row.kind]}, {_default(row)}" + (", *live*" if row.live else "")
-    return f"`{row.name}`", kind, _allowed(row), row.description
+    described = _IF_EMPTY.fullmatch(row.description)
+    meaning, default = described.groups() if described else (row.description, _default(row))
+    kind = f"{_TYPES[row.kind]}, {default}" + (", *live*" if row.live else "")
+    return f"`{row.name}`", kind, _allowed(row), meaning
 
 
 def _allowed(row: Parameter) -> str:

@@ -6,11 +6,11 @@ itself, `viable` is False and the interval is what a controller can still use of
 clipped to the acceleration limits and, if they still cross, both set to their mean.
 
 - `naive_bounds`: eq. (2) of [DelPrete2018]. A larger `dt` than the control period makes it
-  gentler, "most of the time" [Park1998, Saab2013].
-- `decre_bounds`, `rubrecht_bounds`: formulas for velocity control [Decre2009, Rubrecht2010,
-  Rubrecht2012], reconstructed from what [DelPrete2018] says of them; `docs/theory/bounds.md` gives
-  the reasons. The joint is taken to move with one velocity u throughout the step and to change it
-  from step to step by at most ``a dt``, a pseudo-acceleration.
+  gentler.
+- `decre_bounds`, `rubrecht_bounds`: formulas for velocity control [Decre2009, Rubrecht2012],
+  reconstructed from what [DelPrete2018] says of them. The joint is taken to move with one velocity
+  u throughout the step and to change it from step to step by at most ``a dt``, a
+  pseudo-acceleration.
 
 Arguments of all: position q and velocity v, shape (n,) or (batch, n), rad and rad/s; the limits of
 n joints; the step dt, s.
