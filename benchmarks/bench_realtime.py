@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Robot, bounds and controller by the wall clock: one process, separate ones, a bare loop.
 
-Each robot plays its demo's goals by turns in the ways to run it; diagnostics of the robot tell
-what was missed: periods without their command in time, and those that passed while the simulated
-robot was late itself, whose motion would have gone on. "both" is what a real robot would miss. A
-bare loop, which sleeps until the next period and does nothing else, shows what the machine itself
-can do; a busy loop, which in each period computes for as long as the one process, what it leaves
-to programs that compute; relays in place of bounds and controller, in the robot's process, what
-messages and simulation take.
+Each robot plays its demo's goals by turns in the ways to run it, and tells what was missed:
+periods without their command in time, and those in which the simulated robot was late itself;
+"both" is what a real robot would miss. A bare loop only sleeps until the next period; a busy loop
+computes in each for as long as the one process; relays stand in place of bounds and controller.
 
 With --loads, robots are sent to random corners of their position limits instead, with stiff gains,
 a process for each node, while the machine is idle, or as many programs as it has processors

@@ -142,19 +142,18 @@ def model_terms(model: pin.Model, given: Arrays) -> float:
     return 1e6 * (time.thread_time() - begin) / len(given["q"])
 
 
-class Stages:
+class Staged(Ours):
     """A controller whose stages are timed."""
 
     def __init__(self) -> None:
-        self._arm = Ours()
+        super().__init__()
         self._seconds: dict[str, float] = {}
-        controller = self._arm.controller
         for stage, owner, function in (
-            ("bounds", self._arm.bounds, "bounds"),
-            ("model", controller.robot, "update"),
-            ("QP built", controller._qp, "build"),
-            ("QP solved", controller._qp, "solve"),
-            ("torque", controller.robot, "torque"),
+            ("bounds", self.bounds, "bounds"),
+            ("model", self.controller.robot, "update"),
+            ("QP built", self.controller._qp, "build"),
+            ("QP solved", self.controller._qp, "solve"),
+            ("torque", self.controller.robot, "torque"),
         ):
             self._watch(stage, owner, function)
 
@@ -171,10 +170,10 @@ class Stages:
         setattr(owner, function, timed)
         self._seconds[stage] = 0.0
 
-    def block(self, given: Arrays) -> dict[str, float]:
+    def stages(self, given: Arrays) -> dict[str, float]:
         """Return microseconds of a step by stage; all else with what the clocks take."""
         self._seconds = dict.fromkeys(self._seconds, 0.0)
-        whole = self._arm.block(given)
+        whole = self.block(given)
         found = {name: 1e6 * each / len(given["q"]) for name, each in self._seconds.items()}
         return found | {"tasks and all else": whole - sum(found.values())}
 
@@ -213,8 +212,8 @@ def measure(given: Arrays, rounds: int, ask_tsid: Any = None) -> None:
         f"step, {solver}": lambda arm=arm: {"whole": arm.block(given)}
         for solver, arm in arms.items()
     }
-    timed = Stages()
-    questions["stages"] = lambda: timed.block(given)
+    timed = Staged()
+    questions["stages"] = lambda: timed.stages(given)
     questions["Pinocchio's terms"] = lambda: {"whole": model_terms(model, given)}
     if ask_tsid is not None:
         parts = ("problem, with bounds", "QP solved", "results")

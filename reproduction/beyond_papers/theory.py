@@ -124,25 +124,21 @@ def _speeds() -> plt.Figure:
     stopped = Stopped("panda")
     picture, axes = plt.subplots(1, 2, figsize=(10, 3.4), sharey=True, layout="constrained")
     with closing(stopped.robot):
-        rng = np.random.default_rng(0)
-        states = [stopped.edge(rng) for _ in range(STATES)]
-        time = [stopped.law.time_to_rest(v) for _, v in states]
-        thrown = [
-            stopped.play(q, v, t, brake=True)[1] for (q, v), t in zip(states, time, strict=True)
-        ]
-        worst = int(np.argmax(thrown))
-        q, v = states[worst]
-        for axis, brake, duration in zip(
-            axes, (True, False), (0.06, time[worst] + 0.05), strict=True
-        ):
+        rng, law = np.random.default_rng(0), stopped.law
+        q, v = max(
+            (stopped.edge(rng) for _ in range(STATES)),
+            key=lambda state: stopped.play(*state, law.time_to_rest(state[1]), brake=True)[1],
+        )
+        durations = 0.06, law.time_to_rest(v) + 0.05
+        for axis, brake, duration in zip(axes, (True, False), durations, strict=True):
             stopped.robot.reset(q, v)
-            stopped.law.start(q, v)
+            law.start(q, v)
             speeds = [v]
             for _ in range(round(duration / stopped.dt)):
                 if brake:
                     stopped.robot.brake(1, stopped.config.torque_max)
                 else:
-                    stopped.robot.stop(stopped.law, 1)
+                    stopped.robot.stop(law, 1)
                 speeds.append(stopped.robot.state().v)
             t = np.arange(len(speeds)) * stopped.dt
             lines = axis.plot(t, np.array(speeds) / stopped.config.velocity_max)

@@ -273,7 +273,7 @@ class Disturbed:
         self._start = self.loop.pose()
         self._rng = np.random.default_rng(7)
         self._until = 0.0
-        self.steps = self.not_finite = self.beyond = self.beyond_pushed = self.relaxed = 0
+        self.steps = self.not_finite = self.beyond = self.beyond_pushed = 0
         self.torque_ratio = self.deepest = self.fastest = 0.0
 
     def run(self, minutes: float) -> None:
@@ -309,7 +309,6 @@ class Disturbed:
         self.not_finite += not np.isfinite(step.tau).all()
         ratio = (np.abs(step.tau) / loop.config.torque_max).max()
         self.torque_ratio = max(self.torque_ratio, float(ratio))
-        self.relaxed += step.relaxation is not None
         over = np.maximum(
             sample.q - loop.config.position_max, loop.config.position_min - sample.q
         ).max()
@@ -321,17 +320,9 @@ class Disturbed:
 
     def told(self) -> str:
         """Return what came out, in a sentence."""
-        if not self.beyond:
-            passed = f"no joint limit passed in {self.steps} steps"
-        else:
-            passed = (
-                f"a joint limit passed in {self.beyond} of {self.steps} steps, "
-                f"{self.beyond_pushed} of them under a push, by up to {1e3 * self.deepest:.1f} "
-                f"mrad and {self.fastest:.3f} rad/s"
-            )
         return (
-            f"torque at most {self.torque_ratio:.4f} of its limits, {self.not_finite} not finite; "
-            f"{passed}; torque short of the bounds in {self.relaxed}"
+            f"torque at most {self.torque_ratio:.4f} of its limits; joint limits passed in "
+            f"{self.beyond} of {self.steps} steps, by up to {1e3 * self.deepest:.1f} mrad"
         )
 
 
