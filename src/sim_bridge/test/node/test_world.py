@@ -91,10 +91,14 @@ def test_what_cannot_be_in_the_world_is_dropped_and_counted(ros):
         push = WrenchStamped()
         push.header.frame_id, push.wrench.force.x = link, force
         pushes.publish(push)
-    nowhere = marker("thing")
+    nowhere, oval, unturned = marker("thing"), marker("thing", type=Marker.SPHERE), marker("thing")
     nowhere.header.frame_id = "nowhere"
+    oval.scale.y = 0.6
+    unturned.pose.orientation.w = 0.0
     markers = [
         nowhere,
+        oval,
+        unturned,
         marker(""),
         marker("thing", position=(math.nan, 0.0, 0.0)),
         marker("thing", size=0.0),
@@ -104,9 +108,9 @@ def test_what_cannot_be_in_the_world_is_dropped_and_counted(ros):
     ]
     ros.talk(MarkerArray, "obstacles", GOAL_QOS).publish(MarkerArray(markers=markers))
     ros.wait_until(lambda: "external_wrench: 2;" in robot.reported("commands_refused"))
-    ros.wait_until(lambda: "obstacles: 6;" in robot.reported("commands_refused"))
+    ros.wait_until(lambda: "obstacles: 8;" in robot.reported("commands_refused"))
     robot.step(times=3)
-    assert "obstacles: 7;" in robot.reported_now("commands_refused")
+    assert "obstacles: 9;" in robot.reported_now("commands_refused")
     np.testing.assert_allclose(robot.q, Q, atol=1e-6)
 
 
