@@ -32,10 +32,7 @@ _SIDE = np.sqrt(0.5)
 
 
 def _pole(name: str, along: str, centre: tuple[float, float, float], length: float) -> Obstacle:
-    turned = {
-        "x": (0.0, _SIDE, 0.0, _SIDE),
-        "y": (_SIDE, 0.0, 0.0, _SIDE),
-    }
+    turned = {"x": (0.0, _SIDE, 0.0, _SIDE), "y": (_SIDE, 0.0, 0.0, _SIDE)}
     return Obstacle(name, "cylinder", (0.04, 0.04, length), centre, turned[along])
 
 

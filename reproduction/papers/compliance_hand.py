@@ -206,7 +206,6 @@ class Pressed(NamedTuple):
     Attributes:
         t: time, s.
         force: of the table on the hand, shape (N, 3), N.
-        measured: what the controller made of the sensor, along the table's normal, N.
         place: of the hand, from where it began, shape (N, 3), m.
         slide: begin and end of the sliding, s.
         loop: that was played.
@@ -214,7 +213,6 @@ class Pressed(NamedTuple):
 
     t: np.ndarray
     force: np.ndarray
-    measured: np.ndarray
     place: np.ndarray
     slide: tuple[float, float]
     loop: DirectLoop
@@ -233,12 +231,7 @@ def press(
         Obstacle("table", "box", (0.2, 0.6, 0.1), table, (0.0, 0.0, 0.0, 1.0))
     )
     end = pin.SE3(start.rotation, start.translation + SLIDE)
-    way = PoseTrajectory(
-        [
-            TrajectoryPoint(0.0, start),
-            TrajectoryPoint(slide[1] - slide[0], end),
-        ]
-    )
+    way = PoseTrajectory([TrajectoryPoint(0.0, start), TrajectoryPoint(slide[1] - slide[0], end)])
     rows = []
 
     def each(t: float) -> None:
@@ -251,12 +244,11 @@ def press(
         force = sum(
             (np.asarray(contact.force) for contact in loop.robot.obstacles.contacts()), np.zeros(3)
         )
-        place = loop.pose().translation - start.translation
-        rows.append((t, force, -hand.axis * interaction.sensor.wrench[2], place))
+        rows.append((t, force, loop.pose().translation - start.translation))
 
     loop.run(duration, each)
-    t, force, measured, place = (np.array(column) for column in zip(*rows, strict=True))
-    return Pressed(t, force, measured, place, slide, loop)
+    t, force, place = (np.array(column) for column in zip(*rows, strict=True))
+    return Pressed(t, force, place, slide, loop)
 
 
 def judge_press(run: Pressed) -> dict[str, float]:
@@ -273,7 +265,6 @@ def judge_press(run: Pressed) -> dict[str, float]:
         return float(np.abs(means[part][window:-window] - FORCE).max() / FORCE)
 
     return {
-        "touched_s": float(run.t[touched]),
         "most_n": float(normal[touched:].max()),
         "least_after_contact_n": float(normal[settled].min()),
         "error_standing": steady(settled & (run.t < run.slide[0])),
@@ -294,10 +285,7 @@ def pressing() -> Figure:
     for name, run in runs.items():
         numbers = judge_press(run)
         figure.metrics |= {f"{name}: {key}": value for key, value in numbers.items()}
-        figure.data |= {
-            f"{name}: {key}": value
-            for key, value in zip(Pressed._fields[:4], run[:4], strict=True)
-        }
+        figure.data[f"{name}: force_n"] = run.force
         standing, sliding = numbers["error_standing"], numbers["error_sliding"]
         holds = max(standing, sliding) < 0.05
         holds &= numbers["most_n"] < FORCE + 2.0 and numbers["least_after_contact_n"] > FORCE - 2.0
