@@ -8,9 +8,6 @@ from functools import cache
 import numpy as np
 import pytest
 from arms import load_arm
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from torque_safety_controller.integral_feedback import MODES, IntegralSettings
 from torque_safety_controller.parts.integral import make_integral
@@ -149,24 +146,20 @@ def test_what_is_forgotten_again_and_again_fades_from_what_it_was(mode):
 
 
 @pytest.mark.parametrize("mode", ["none", "joints", "task"])
-@pytest.mark.parametrize("gap", [3600.0, 2.6 * DT, 0.0, -1.0, math.nan, math.inf])
-def test_time_may_jump(mode, gap):
+@pytest.mark.parametrize(
+    ("gap", "skipped"),
+    [(0.5, 0), (2.0, 0), (2.6, 1), (3.6e6, 1), (0, 1), (-1e3, 1), (math.nan, 1), (math.inf, 1)],
+)
+def test_time_may_jump(mode, gap, skipped):
+    """By a gap of so many periods; half and twice a period are integrated over."""
     loop = settled(mode)
-    loop.step(elapsed=gap)
-    skipped = int(mode != "none")  # what only fades integrates nothing
+    loop.step(elapsed=gap * DT)
+    skipped = skipped if mode != "none" else 0  # what only fades integrates nothing
     assert loop.action.skipped == skipped
     loop.run(0.05)
     # At most 1.25% of what is to fade, which is no more than the budget.
-    assert loop.steps(51) < 0.0125 * 0.2
+    assert loop.steps(51) < (0.0125 * 0.2 if skipped else 1e-3)
     assert loop.action.skipped == skipped
-
-
-@pytest.mark.parametrize("gap", [0.5 * DT, 2.0 * DT])
-def test_a_period_that_is_short_or_twice_as_long_is_integrated(gap):
-    loop = settled("joints")
-    loop.step(elapsed=gap)
-    assert loop.action.skipped == 0
-    assert loop.steps(1) < 1e-3
 
 
 def test_the_memory_fades_while_time_jumps_again_and_again():
@@ -181,49 +174,26 @@ def test_the_memory_fades_while_time_jumps_again_and_again():
     assert relative(loop.action.last) < 0.2 * relative(begin)
 
 
-def test_an_arm_that_stood_still_meanwhile_goes_on():
-    loop = settled("joints")
-    before = loop.action.last
-    loop.v = REST  # its brakes held it for 2 s
-    loop.step(elapsed=2.0)
-    loop.run(0.1)
-    assert loop.steps(101) < 0.0125 * 0.2
-    np.testing.assert_allclose(loop.action.last, before, atol=0.02 * ARM.tau_max.max())
-
-
 # Velocities and positions that jump
-
-
-def after_glitch(mode, size, **changed):
-    """An arm 50 ms after its velocity was misread once, and how far off its torque is."""
-    loop, other = settled(mode, **changed), settled(mode, **changed)
-    seen = loop.v.copy()
-    seen[2] += size
-    with np.errstate(all="ignore"):
-        loop.step(v_seen=seen)
-    other.step()
-    # What the spring and the damper make of a glitch is not of interest here.
-    loop.q, loop.v, loop.a = other.q.copy(), other.v.copy(), other.a.copy()
-    loop.run(0.05)
-    other.run(0.05)
-    return loop, relative(loop.action.last - other.action.last)
 
 
 @pytest.mark.parametrize(
     ("mode", "size"), [("joints", 10.0), ("joints", -1e308), ("task", -300.0), ("task", 1e100)]
 )
 def test_a_glitch_of_the_velocity_is_not_integrated(mode, size):
-    loop, off = after_glitch(mode, size)
+    loop, other = settled(mode), settled(mode)
+    seen, before = loop.v.copy(), loop.action.last
+    seen[2] += size
+    with np.errstate(all="ignore"):
+        np.testing.assert_array_equal(loop.step(v_seen=seen), before)
+    other.step()
+    # What the spring and the damper make of a glitch is not of interest here.
+    loop.q, loop.v, loop.a = other.q.copy(), other.v.copy(), other.a.copy()
+    loop.run(0.05)
+    other.run(0.05)
     assert loop.action.skipped in (2, 3)
-    np.testing.assert_array_equal(loop.torques[-51], loop.torques[-52])
     assert loop.steps(51) < 1e-3
-    assert off < 2e-3
-
-
-def test_a_glitch_that_is_integrated_is_felt_for_long():
-    loop, off = after_glitch("joints", 10.0, disturbance_max=math.inf)
-    assert loop.action.skipped == 0
-    assert off > 0.04
+    assert relative(loop.action.last - other.action.last) < 2e-3
 
 
 def test_a_position_that_jumps_is_seen_and_one_that_moves_is_not():
@@ -306,46 +276,3 @@ def test_a_beginning_with_numbers_beyond_sense_is_put_off(mode):
     np.testing.assert_array_equal(loop.action.torque(loop.robot, loop.a, DT), REST)
     loop.run(0.4)
     assert relative(loop.action.last) > 0.02
-
-
-NUMBERS = st.one_of(
-    st.floats(-3.0, 3.0),
-    st.floats(allow_nan=False, allow_infinity=False),
-    st.sampled_from([math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, 0.0]),
-)
-VECTORS = st.one_of(st.just(REST), arrays(float, N, elements=NUMBERS))
-STEPS = st.lists(
-    st.tuples(
-        VECTORS,
-        VECTORS,
-        VECTORS,
-        st.one_of(st.just(DT), NUMBERS),
-        st.sampled_from([None, 0.0, 1.0, 5.0]),
-    ),
-    min_size=1,
-    max_size=8,
-)
-
-
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(mode=st.sampled_from(MODES), steps=STEPS)
-def test_it_is_finite_and_never_raises(mode, steps):
-    robot = ARM.robot(DT)
-    robot.rates = True
-    action = make_integral(mode, make_settings(), 1e9 * ARM.tau_max)
-    with np.errstate(all="ignore"):
-        for q, v, a, elapsed, theta in steps:
-            if theta is not None:
-                action.settings = make_settings(slow_leak_rate=theta)
-            robot.update(State(ARM.q_start + q, v), a)
-            torque = action.torque(robot, a, elapsed)
-            assert np.isfinite(torque).all()
-            assert (np.abs(torque) <= 2.0 * BUDGET).all()
-        # And it comes round.
-        robot.update(State(ARM.q_start, REST), REST)
-        for _ in range(4):
-            action.torque(robot, REST, DT)
-        skipped = action.skipped
-        for _ in range(3):
-            action.torque(robot, REST, DT)
-        assert action.skipped == skipped

@@ -56,19 +56,6 @@ def test_derivative_is_that_of_what_is_returned(robot, rows, threshold):
         assert damped == (8 if threshold == 2.0 else 0)
 
 
-def test_derivative_where_singular_values_meet():
-    """Two equal ones below the threshold, of which no eigenvector is a smooth function of time."""
-    rng = np.random.default_rng(2)
-    J = np.ascontiguousarray(0.1 * np.linalg.qr(rng.normal(size=(5, 5)))[0][:3])
-    J_dot, M, h = rng.normal(size=J.shape), np.eye(5), 1e-6
-    _, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, 0.0 * M, 0.2)
-    above, below = (
-        dynamically_consistent_inverse(J + k * J_dot, J_dot, M, 0.0 * M, 0.2)[0] for k in (h, -h)
-    )
-    expected = (above - below) / (2.0 * h)
-    np.testing.assert_allclose(J_plus_dot, expected, rtol=1e-6, atol=1e-6)
-
-
 def test_what_damping_leaves_is_exact_in_the_other_directions():
     arm, threshold = TaskArm("talos"), 0.3
     for q, v in states(arm, 10):
