@@ -222,6 +222,7 @@ def test_correction_only_shrinks():
         for before, after in ((fast, feedback.memory.fast), (slow, feedback.memory.slow)):
             kept = after / before
             assert ((kept >= 0.0) & (kept <= 1.0)).all()
+            assert (kept[before * s < 0.0] == 1.0).all()  # it does not contribute
             shrunk += (kept < 1.0).any()
         assert (feedback.s * s >= -SHARP).all()
     assert shrunk > 200

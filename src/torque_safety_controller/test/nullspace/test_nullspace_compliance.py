@@ -17,7 +17,6 @@ from torque_safety_controller.integral_feedback import (
 from torque_safety_controller.integral_feedback.nullspace import (
     NullspaceCompliance,
     TaskShapeError,
-    fast_weight,
 )
 from torque_safety_controller.integral_feedback.nullspace_step import THRESHOLD
 
@@ -31,7 +30,8 @@ def unlimited(n, **changes) -> IntegralSettings:
 def energy(compliance, M) -> float:
     """What the memory stores, J."""
     a, x = compliance.memory.a, compliance.memory.root / np.sqrt(np.diag(M))
-    weight = fast_weight(compliance.settings)
+    settings = compliance.settings
+    weight = settings.mu * settings.gain / (settings.fast_leak_rate - settings.slow_leak_rate)
     return 0.5 * (a @ M @ a + weight * x @ (np.diag(M) * x))
 
 
@@ -154,7 +154,7 @@ def test_always_finite_and_within_the_budget(rng, m, budget):
     law = IntegralSettings(
         budgets,
         mu=rng.choice([0.0, 0.5, 1.0]),
-        slow_leak_rate=rng.choice([0.0, 0.1, 3.0]),
+        slow_leak_rate=rng.choice([0.0, 0.1, 2.0]),
         fast_leak_rate=rng.choice([3.0, 100.0]),
     )
     compliance = NullspaceCompliance(law, m)

@@ -124,32 +124,3 @@ def test_integral_of_the_task_error_is_exact(robot, rows, slow):
         largest = max(largest, np.abs(expected).max())
         np.testing.assert_allclose(loop.terms.J @ loop.a, expected, atol=1e-12)
     assert largest > 0.1
-
-
-def test_integral_of_the_task_error_near_a_singularity():
-    """What is lost there, step by step: the relation of the documentation, to rounding."""
-    dt, theta = 1e-3, 2.0
-    leaks = dict(slow_leak_rate=theta, fast_leak_rate=theta)
-    loop = PassivityLoop("panda", 6, dt, disturbance=0.1, **STRETCHED, **leaks)
-    decay, gain = leak_factors(theta, dt, False)
-    lost_most, near = 0.0, 0
-    for _ in range(100):
-        J, v, a, J_plus = loop.terms.J, loop.v, loop.a.copy(), loop.inverse()
-        loop.step()
-        near += loop.near_singular()
-        error = loop.a_ref * dt - (loop.v - v)
-        J_new = loop.terms.J
-        R, R_new = np.eye(6) - J @ J_plus, np.eye(6) - J_new @ loop.inverse()
-        s = a - J_plus @ J @ a
-        middle = 0.5 * (decay * s + decay * s + gain * error)
-        integral = -decay * J @ a + (J_new - J) @ middle
-        lost = R_new @ integral + decay * R @ J @ a
-        expected = decay * J @ a + gain * 0.5 * (J + J_new) @ error + lost
-        np.testing.assert_allclose(J_new @ loop.a, expected, atol=1e-11)
-        lost_most = max(lost_most, np.abs(lost).max())
-        # Nothing is lost in directions that are damped neither now nor before.
-        U, singular, _ = np.linalg.svd(np.hstack([R, R_new]))
-        assert (singular < 1e-9).any()
-        np.testing.assert_allclose(U[:, singular < 1e-9].T @ lost, 0.0, atol=1e-9)
-    assert near > 10
-    assert lost_most > 1e-6
