@@ -118,8 +118,9 @@ def test_it_begins_with_the_torque_it_is_told(mode):
         assert relative(after - torque) <= 0.01
 
 
-def test_what_cannot_be_initialised_fades():
-    loop = IntegralLoop("joints")
+@pytest.mark.parametrize("mode", ["none", "joints"])
+def test_what_no_memory_can_hold_fades(mode):
+    loop = IntegralLoop(mode)
     loop.robot.update(State(loop.q, REST), REST)
     loop.robot.C = -LAMBDA * np.diag(np.diagonal(loop.robot.M))  # C + K is singular
     torque = 0.1 * ARM.tau_max
