@@ -105,18 +105,6 @@ def test_a_ball_before_a_wall_by_hand():
     assert rows.G[0] @ a + rows.bias[0] == pytest.approx(-(J @ a + x_bias))
 
 
-def test_a_ball_around_a_ball_by_hand():
-    """Nothing changes on a circle about the other ball; on a line past it, d'' = v^2 / d."""
-    circle, _ = two_links(BALL, 0.4, [sphere("ball", [0.0, 0.0, 0.0], 0.1)], influence=5.0)
-    rows = wide_rows(circle, np.array([0.3, 0.5]), np.array([2.0, 0.0]))
-    assert rows.rate[0] == pytest.approx(0.0, abs=1e-12)
-    assert rows.bias[0] == pytest.approx(0.0, abs=1e-12)
-    aside = sphere("ball", [0.9, 0.5, 0.0], 0.1)
-    line, _ = two_links(BALL, 0.4, [aside], "prismatic", "1 0 0", influence=5.0)
-    rows = wide_rows(line, np.zeros(2), np.array([0.0, 0.8]))
-    assert rows.bias[0] == pytest.approx(0.8**2 / 0.5)
-
-
 def test_ends_have_rows_before_the_closest_point_jumps_there():
     """A rod parallel to a wall of a box turns in its plane: one end comes, the other goes."""
     block = box("block", [0.7, 0.2, 0.0], [1.0, 0.1, 1.0])

@@ -57,26 +57,6 @@ def test_the_bound_is_that_of_a_joint_with_a_lower_limit():
     assert braked > 10
 
 
-def test_rows_are_left_out_only_if_bounds_imply_them_or_there_is_twice_the_way_to_stop():
-    limits, usual, every = panda()[1], panda_avoidance(1000), everything()
-    some = far = 0
-    for q, v in random_states(80, speed=1.5, seed=5):
-        wide = wide_rows(every, q, v)
-        least = np.where(wide.G > 0.0, limits.a_min, limits.a_max)
-        needed = np.count_nonzero(np.sum(wide.G * least, axis=1) < wide.lower)
-        near = set(usual.rows(q, v, limits.a_min, limits.a_max).pair)
-        rows = every.rows(q, v, limits.a_min, limits.a_max)
-        assert len(rows.lower) == needed
-        for pair, d, rate in zip(rows.pair, rows.distance, rows.rate, strict=True):
-            if pair not in near:
-                assert d > 0.1
-                assert d - KEPT > rate**2 / 2.0
-                far += 1
-        some += needed
-    assert some > 50
-    assert far > 10
-
-
 def test_of_too_many_rows_the_nearest_are_returned():
     limits, few, every = panda()[1], panda_avoidance(3), panda_avoidance(1000)
     cut = 0

@@ -53,23 +53,6 @@ def test_a_pyramid_of_four_sides_spans_a_cone_of_seven_tenths_of_the_friction(
     assert nnls(edges, force)[1] < 1e-7
 
 
-def test_a_patch_exerts_moments_with_the_centre_of_pressure_inside():
-    contact = FrictionContact(HAND, SOLE, np.array([0.0, 0.0, -2.0]), 0.5)
-    pyramid = friction_pyramid(np.array([0.0, 0.0, -1.0]), 0.5)
-    rng = np.random.default_rng(2)
-    for _ in range(50):
-        rho = rng.exponential(size=16) ** 3
-        force, moment = np.split(contact.wrench(rho), 2)
-        expected = sum(
-            np.cross(point, pyramid @ rho[4 * i : 4 * i + 4]) for i, point in enumerate(SOLE)
-        )
-        np.testing.assert_allclose(moment, expected, atol=1e-12)
-        moment = moment - np.cross([0.0, 0.0, 0.1], force)  # about the middle of the sole
-        centre = np.array([-moment[1], moment[0]]) / force[2]
-        assert (np.abs(centre) <= [0.05 + 1e-12, 0.03 + 1e-12]).all()
-    assert np.linalg.matrix_rank(contact.W) == 6
-
-
 class ContactArm:
     """Panda with a contact, a sole on its hand or a point on its elbow, at a state."""
 
@@ -150,12 +133,6 @@ def test_pressing_takes_gravity_and_the_transposed_jacobian_times_the_force():
     hand = arm.model.getFrameId(HAND)
     J = pin.computeFrameJacobian(arm.model, arm.model.createData(), arm.q, hand, pin.LOCAL)
     np.testing.assert_allclose(tau, arm.dynamics()[1] - J.T @ F_des, atol=1e-4)
-
-
-def test_pressing_in_motion_serves_both_tasks():
-    F_des = np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0])
-    wrench, _ = ContactArm(speed=0.2).press(F_des)
-    np.testing.assert_allclose(wrench, F_des, atol=1e-4)
 
 
 def test_the_force_ends_where_the_torque_does():

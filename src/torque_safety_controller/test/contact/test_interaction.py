@@ -103,16 +103,6 @@ def test_the_task_asks_for_what_equation_27_says(seed):
     np.testing.assert_allclose(robot.J @ a + robot.drift, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("push", [0.1, 100.0])
-def test_the_hand_does_not_rush(push):
-    """It settles at the speed of (27) against the damping, or at the limit."""
-    direction = np.array([2.0, -1.0, 2.0]) / 3.0
-    wrench = push * np.concatenate([direction, direction])
-    g = admittance(-wrench, np.zeros(6), (0.1, 0.2), (0.02, 0.1), 50.0)
-    np.testing.assert_allclose(g[:3] / 50.0, min(0.1 * push / 50.0, 0.02) * direction)
-    np.testing.assert_allclose(g[3:] / 50.0, min(0.2 * push / 50.0, 0.1) * direction)
-
-
 def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
     """The paper's weights: the mean of what the two tasks want, in the direction of force only."""
     hand = SimulatedHand(force_directions=Z)
@@ -126,24 +116,6 @@ def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
     assert hand.accelerates(too_much)[2] == pytest.approx(-2.0 * wanted, rel=1e-3)
     enough = hand.step(force(z=-3.0), count=2)
     np.testing.assert_allclose(hand.accelerates(enough), 0.0, atol=1e-4)
-
-
-def test_no_stiffness_is_left_where_force_is_controlled():
-    hand = SimulatedHand(force_directions=Z)
-    hand.goals.set_pose(hand.start * pin.SE3(np.eye(3), np.array([0.01, 0.0, 0.02])))
-    hand.interaction.set_target(np.zeros(6))
-    a = hand.accelerates(hand.step(force()))
-    assert a[0] == pytest.approx(GAINS.pose_kp * 0.01, rel=1e-2)
-    assert a[2] == pytest.approx(0.0, abs=1e-4)
-
-
-def test_a_target_in_the_base_frame_turns_with_the_hand():
-    hand = SimulatedHand(force_directions=np.ones(6))
-    pressed = np.array([1.0, 2.0, -3.0, 0.1, 0.2, 0.3])
-    hand.interaction.set_target(pressed, np.eye(3))
-    hand.step(np.zeros(6), count=1500)
-    expected = -(pressed.reshape(2, 3) @ hand.start.rotation).ravel()
-    np.testing.assert_allclose(hand.interaction.reference, expected, atol=1e-5)
 
 
 # Contact

@@ -102,24 +102,6 @@ def test_the_integral_carries_what_the_model_does_not_know():
     assert errors["task"] < 0.1 * errors["none"]
 
 
-def test_in_hold_nothing_grows_on_what_the_motors_cannot_give(arm):
-    controller = with_integral(arm, gains=replace(GAINS, hold_kd=100.0))
-    action, robot = controller.find(Integral).action, controller.robot
-    q, v = arm.q_start, np.zeros(arm.n)
-    robot.update(State(q, v), v)
-    # So fast that to brake as it should takes 1.8 times what the first motor has.
-    v[0] = 1.8 * arm.tau_max[0] / (100.0 * robot.M[0, 0])
-    saturated = 0
-    for _ in range(8):
-        step = controller.step(State(q, v), None, REST, KHZ)
-        saturated += abs(step.tau[0]) == arm.tau_max[0]
-        q, v = arm.move(q, v, step.tau, KHZ, steps=2)
-    assert saturated > 4
-    assert action.skipped == 0
-    # With the accelerations that were wished for, half of the budget would be used up by now.
-    assert (np.abs(action.last) < 0.02 * arm.tau_max).all()
-
-
 # The handover
 
 
@@ -137,14 +119,6 @@ def test_it_takes_over_the_torque_of_others(arm, mode):
     np.testing.assert_allclose(after.a, 0.0, atol=5e-3)
     assert controller.goals.pose_des.isApprox(pose_at(arm, arm.q_start))
     np.testing.assert_array_equal(controller.goals.q_des, arm.q_start)
-
-
-def test_torque_beyond_the_limits_is_taken_over_up_to_them(arm):
-    controller = with_integral(arm)
-    controller.resume(at_rest(arm), wide(arm), 1.5 * arm.tau_max)
-    step = controller.step(at_rest(arm), wide(arm))
-    assert_may_be_sent(step, arm)
-    assert (step.tau > 0.97 * arm.tau_max).all()
 
 
 def test_the_rate_of_torque_counts_from_what_was_measured(arm):

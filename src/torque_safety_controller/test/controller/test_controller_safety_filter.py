@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The safety filter in the controller: what the QP is given, and what is sent in the end."""
 
-from dataclasses import replace
-
 import controllers
 import numpy as np
 from arms import load_arm
@@ -10,7 +8,6 @@ from controllers import posture_only
 
 from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 from torque_safety_controller.qp import AccelerationRange
-from torque_safety_controller.supervisor import REST
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 
@@ -81,32 +78,6 @@ def test_where_it_cannot_be_held_the_arm_goes_to_no_goal_but_slows_down():
     assert tracks.a[WRIST] > 10.0
     assert not brakes.tracking
     assert brakes.a[WRIST] < -5.0
-
-
-def test_without_limits_the_arm_brakes_as_the_filter_allows():
-    controller = make()
-    v = np.array([0.1, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
-    controller.reset(FOLDED)
-    step = controller.step(State(FOLDED, v), None, REST)
-    np.testing.assert_allclose(step.a, -GAINS.hold_kd * v)
-    assert controller.find(SafetyFilter).outcomes == {"as wanted": 1}
-    step = controller.step(State(EDGE, v), None, REST)
-    assert (np.abs(step.tau) <= ARM.tau_max).all()
-
-
-def test_a_disturbance_that_is_known_counts():
-    """Seen after a few steps in which the arm fell more than it was told to."""
-    loads = []
-    for fall in (0.0, -2.0):
-        controller = make(gains=replace(GAINS, disturbance_time=1e-6))
-        controller.reset(ARM.q_start)
-        controller.goals.set_posture(ARM.q_start)
-        v = np.zeros(ARM.n)
-        for _ in range(4):
-            v = v + ARM.dt * controller.step(State(ARM.q_start, v), LIMITS).a
-            v[SHOULDER] += ARM.dt * fall
-        loads.append(controller.find(SafetyFilter).rest_torque[SHOULDER])
-    assert abs(loads[1] - loads[0]) > 0.5
 
 
 def test_with_a_plan_the_qp_never_has_to_give_way():

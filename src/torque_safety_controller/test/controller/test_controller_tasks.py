@@ -30,34 +30,6 @@ def within(arm, a) -> AccelerationRange:
     return AccelerationRange(np.full(arm.n, -a), np.full(arm.n, a))
 
 
-def test_accelerations_stay_inside_their_bounds(arm):
-    rng = np.random.default_rng(4)
-    controller = make(arm)
-    controller.goals.set_posture(arm.q_max - 0.1)
-    at_bound = 0
-    for _ in range(50):
-        lower, upper = -rng.uniform(0.1, 1.0, arm.n), rng.uniform(0.1, 1.0, arm.n)
-        step = controller.step(at_rest(arm), AccelerationRange(lower, upper))
-        assert step.relaxation is None
-        assert (step.a >= lower - SOLVED).all()
-        assert (step.a <= upper + SOLVED).all()
-        at_bound += (step.a >= upper - 1e-3).any()
-    assert at_bound > 40, "the bounds are hardly felt"
-
-
-def test_the_torque_gives_the_acceleration_asked_for(arm):
-    rng = np.random.default_rng(5)
-    controller = strong(arm)
-    controller.goals.set_pose(pose_at(arm, arm.q_start + 0.1))
-    for _ in range(10):
-        q, v = arm.random_state(rng)
-        controller.reset(q)
-        step = controller.step(State(q, v), wide(arm))
-        _, v_end = arm.move(q, v, step.tau, arm.dt, steps=8)
-        asked = step.a * arm.dt
-        np.testing.assert_allclose(v_end - v, asked, atol=0.02 * np.abs(asked).max() + 1e-4)
-
-
 def test_bounds_that_the_motors_cannot_keep_are_relaxed_and_reported(arm):
     controller = make(arm)
     controller.goals.set_posture(arm.q_start)

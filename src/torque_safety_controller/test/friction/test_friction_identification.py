@@ -112,14 +112,6 @@ def test_noise_is_what_the_standard_errors_say(recording):
     assert (residuals > 0.02).all() and (residuals < 0.15).all()
 
 
-def test_a_few_collisions_do_not_matter(recording):
-    tau = recording.tau.copy()
-    for begin in (3000, 6100, 9000):
-        tau[begin : begin + 60] += 5.0 * COULOMB
-    fits = fitted(Recording(recording.t, recording.q, recording.v, tau))
-    assert np.abs(off(fits)).max() < 0.03
-
-
 def test_joints_that_stand_or_go_one_way_are_not_guessed_at():
     fits = fitted(record(*KINDS, still=[2]))
     assert "did not move both ways" in fits[2].notes[0]
@@ -137,12 +129,6 @@ def test_ways_that_differ_tell_nothing():
     other = recording.q + np.where(recording.v > 0.0, 0.0, 1.0)  # another place on the way back
     fits = fitted(Recording(recording.t, other, recording.v, recording.tau))
     assert any("cannot be told from errors" in fit.notes[0] for fit in fits if fit.notes)
-
-
-def test_fast_motion_tells_no_stiction():
-    for fit, coulomb in zip(fitted(record(FAST, FAST)), COULOMB, strict=True):
-        assert any("stiction" in note for note in fit.notes)
-        assert fit.static == fit.coulomb == pytest.approx(coulomb, rel=0.02)
 
 
 def test_a_robot_without_stiction_or_without_friction_has_none():

@@ -64,15 +64,6 @@ def test_what_cannot_be_used_is_named(tmp_path, changed, message):
         loaded(tmp_path, contents)
 
 
-@pytest.mark.parametrize("content", [None, b"", b"PK\x03\x04 no archive", b"t,q\n0,1\n"])
-def test_files_that_are_no_recordings(tmp_path, content):
-    path = tmp_path / "run.npz"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(RecordingError, match="run.npz: no NumPy file"):
-        load_recording(path, JOINTS)
-
-
 def test_blocks_are_averages():
     blocks = make_blocks(Recording(**arrays(201)), 0.02)
     np.testing.assert_allclose(blocks.t, 0.01 + 0.02 * np.arange(10), atol=1e-12)
@@ -83,17 +74,6 @@ def test_blocks_are_averages():
     np.testing.assert_allclose(blocks.bend, 0.0, atol=1e-12)
     with pytest.raises(RecordingError, match="too short: 0.01 s"):
         make_blocks(Recording(**arrays(11)), 0.02)
-
-
-def test_blocks_tell_noise_from_stick_and_slip():
-    rng = np.random.default_rng(0)
-    t = 1e-3 * np.arange(20001)
-    v = np.column_stack([np.sin(t), np.where(np.sin(20.0 * t) > 0.9, 1.0, 0.0)])
-    v[:, 0] += 2e-3 * rng.standard_normal(t.size)
-    blocks = make_blocks(Recording(t, v, v, v), 0.02)
-    assert blocks.noise[0] == pytest.approx(2e-3 / math.sqrt(21), rel=0.05)
-    assert blocks.bend[:, 0].max() < 4e-3
-    assert blocks.bend[:, 1].max() > 0.2
 
 
 def test_gaps_are_left_out():

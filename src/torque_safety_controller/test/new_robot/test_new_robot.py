@@ -13,7 +13,6 @@ from torque_safety_controller.new_robot.chain import NewRobotError, find_chain
 from torque_safety_controller.new_robot.estimates import estimate
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.tools.new_robot import main
-from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.robot.description import load_geometry, read_urdf
 
 ROBOTS = "package://example-robot-data/robots/"
@@ -110,17 +109,6 @@ def test_start_and_goals_are_free_of_collisions_and_can_be_held():
         assert (np.abs(gravity) <= 0.9 * chain.tau_max).all()
     folded = np.array([0.0, -1.5, np.pi, 0.0, 0.0, 0.0])  # the forearm in the upper arm
     assert touches(folded)
-
-
-def test_missing_limits_come_from_the_urdf(tmp_path):
-    path = tmp_path / "robot.yaml"
-    joints = ", ".join(chain_of("panda").joints)
-    text = f"/**: {{ros__parameters: {{robot_description: {PANDA}, joints: [{joints}]}}}}"
-    path.write_text(text)
-    robot = read_robot(path)
-    np.testing.assert_array_equal(robot.q_min, chain_of("panda").q_min)
-    np.testing.assert_array_equal(robot.tau_max, chain_of("panda").tau_max)
-    np.testing.assert_array_equal(robot.v_max, chain_of("panda").v_max)
 
 
 LIMIT = '<limit lower="-1" upper="2" effort="30" velocity="4"/>'

@@ -25,16 +25,6 @@ def known_torque(handover, torques):
     raise AssertionError("it never was")
 
 
-def test_the_position_is_captured_once_and_copied():
-    handover = make()
-    q = Q.copy()
-    handover.hold(q)
-    q += 1.0
-    np.testing.assert_array_equal(handover.hold(q), Q)
-    handover.release()
-    np.testing.assert_array_equal(handover.hold(q), q)
-
-
 @pytest.mark.parametrize(
     ("q", "tau", "reason"),
     [

@@ -88,10 +88,3 @@ def test_a_joint_that_moves_on_stops_before_its_limit_more_gently_than_its_bound
         q, v = q + dt * v + 0.5 * dt * dt * a, v + dt * a
         assert (np.abs(q) < 1.0).all()
     assert abs(v[0]) < 1e-3 + 0.01 * speed
-
-
-def test_where_limits_are_left_the_bounds_count_as_they_are():
-    bounds = AccelerationRange(np.array([3.0, -9.0]), np.array([9.0, -3.0]))
-    beyond, v = np.array([-1.01, 1.01]), np.array([-0.1, 0.1])
-    found = SlowDown(*LIMITS, DT).return_bounds(bounds, beyond, v, 0.0)
-    np.testing.assert_array_equal(found, bounds)

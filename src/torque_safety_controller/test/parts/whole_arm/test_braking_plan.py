@@ -2,16 +2,13 @@
 """Braking plans: where they end, what is left of them after a step, and how torques change."""
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from torque_safety_controller.parts.whole_arm.braking_plan import (
     PlanLimits,
-    PlanTorques,
     braking_periods,
     narrow,
     sample,
-    torque_change,
 )
 
 DT = 0.01
@@ -74,25 +71,6 @@ def test_a_plan_ends_within_the_limits_and_its_samples_are_its_states(seed):
     assert (np.abs(velocities) <= np.abs(v) + 1e-12).all()
 
 
-@pytest.mark.parametrize(
-    ("place", "speed", "expected", "beyond"),
-    [
-        (0.0, 0.1, 30, 0.0),  # the time that is asked for
-        (1.1, 1.0, 20, 0.0),  # stands at the limit
-        (1.1, -1.0, 30, 0.0),  # which is not ahead
-        (1.2 - 0.02, 1.0, 4, 0.0),  # harder than usual, as nothing else helps
-        (1.3, 0.1, 1, 0.1 + 0.5 * 0.1 * DT - 1e-3),  # beyond: at once
-        (-1.02, 0.5, 30, 0.02 - 1e-3),  # on its way back
-    ],
-)
-def test_how_long_a_joint_takes_and_by_how_far_it_passes_its_limit(place, speed, expected, beyond):
-    q, v = np.zeros(N), np.zeros(N)
-    q[3], v[3] = place, speed
-    periods = periods_of(q, v, 0.3)
-    assert periods[3] == expected
-    assert sampled(q, v, periods)[-1] == pytest.approx(beyond)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_the_rest_of_a_plan_is_a_plan(seed):
     """What makes one plan, once found, enough for ever: period by period until it stands."""
@@ -126,53 +104,3 @@ def test_bounds_are_narrowed_to_the_last_acceleration_from_which_a_joint_can_sto
                 speed = sign * v[j] + DT * a
                 place = sign * q[j] + 0.5 * DT * (sign * v[j] + speed)
                 assert passes(place, speed, BRAKING[j], limit[j]) == expected
-
-
-def sample_model():
-    """A manipulator of seven joints."""
-    model = pin.buildSampleModelManipulator()
-    joint = model.addJoint(model.njoints - 1, pin.JointModelRX(), pin.SE3.Random(), "more")
-    model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Identity())
-    assert model.nv == N
-    return model
-
-
-def test_torques_of_plans_are_those_of_inverse_dynamics_with_what_is_given_besides():
-    rng, model = np.random.default_rng(0), sample_model()
-    data, usable, extra = model.createData(), rng.uniform(5.0, 50.0, N), rng.normal(size=N)
-    q, v = random_state(rng)
-    periods = braking_periods(q, v, np.array([0.1, 0.4]), *LIMITS)
-    plans = PlanTorques(model, LIMITS, usable).evaluate(q, v, periods, extra)
-    for i in range(2):
-        for k in range(len(plans.samples.clock[i])):
-            state = (each[i, k] for each in plans.samples[1:])
-            tau = pin.rnea(model, data, *state) + extra
-            np.testing.assert_allclose(plans.tau[i, k], tau, atol=1e-9)
-        assert plans.slack[i] == pytest.approx(1.0 - (np.abs(plans.tau[i]) / usable).max())
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_torques_change_as_the_derivatives_say(seed):
-    """Against the torques of plans from states a little apart, at each kind of sample."""
-    rng, model = np.random.default_rng(seed), sample_model()
-    data, step = model.createData(), 1e-4
-    q, v = random_state(rng)
-    periods = periods_of(q, v, 0.4)
-    rest = np.maximum(periods - 1.0, 1.0)
-    states = played(q, v, periods)
-    begin = states[0][2]
-
-    def torque(a, k):
-        after = played(q + v * DT + 0.5 * DT * DT * a, v + DT * a, rest)
-        return pin.rnea(model, data, *after[min(k, len(after) - 1)])
-
-    ends = np.unique(periods)
-    for clock in (1, 5, int(ends[0] + ends[-1]) // 2, int(ends[-1]) - 1, int(ends[-1]) + 1):
-        by_q, by_v, M = pin.computeRNEADerivatives(model, data, *states[clock])
-        M = np.triu(M) + np.triu(M, 1).T
-        change = torque_change(float(clock), periods, by_q, by_v, M, DT)
-        for j in np.flatnonzero(periods > 1):
-            da = step * np.eye(N)[j]
-            measured = (torque(begin + da, clock - 1) - torque(begin - da, clock - 1)) / (2 * step)
-            scale = max(np.abs(measured).max(), 1e-6)
-            np.testing.assert_allclose(change[:, j], measured, atol=1e-4 * scale)

@@ -176,18 +176,6 @@ def test_constraints_leave_the_plan_as_it_is():
     assert seen > 0
 
 
-def test_torque_that_is_given_besides_counts():
-    arm = Arm("baxter_left_arm")
-    keeper, zero, wide = arm.filter(), np.zeros(arm.n), np.full(arm.n, 1e3)
-    keeper.update(arm.start, zero, zero, -wide, wide)
-    free, held = keeper.slack, keeper.rest_torque
-    extra = np.zeros(arm.n)
-    extra[SHOULDER] = 0.2 * arm.tau_max[SHOULDER] * np.sign(held[SHOULDER])
-    keeper.update(arm.start, zero, extra, -wide, wide)
-    np.testing.assert_allclose(keeper.rest_torque, held + extra)
-    assert keeper.slack == pytest.approx(free - 0.2 / (1.0 - RESERVE))
-
-
 def test_plans_leave_a_reserve_and_count_what_is_more_than_it():
     """Whatever acts besides, up to the reserve, may change at any time: plans do not see it."""
     arm = Arm("baxter_left_arm")
