@@ -8,7 +8,6 @@ from collision_arm import Journey, box, half_space, panda, sphere, two_links
 from torque_safety_controller.parts.collision.avoidance import Collision
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.state import State
 
 MARGIN, RESERVE = 0.02, 0.002  # m
 TOLERANCE = 5e-4  # m; of the reserve, what may be used in these motions
@@ -16,17 +15,17 @@ DT = 2e-3
 BALL = '<sphere radius="0.05"/>'
 
 
-def journey(dt=DT, obstacles=True, move=None):
+def journey(obstacles=True, move=None):
     arm, limits, collision = panda(obstacles)
-    avoidance = Collision(collision, limits.a_min, limits.a_max, 2.0 * dt)
-    return arm, Journey(avoidance, limits, dt, move)
+    avoidance = Collision(collision, limits.a_min, limits.a_max, 2.0 * DT)
+    return arm, Journey(avoidance, arm.robot(DT), limits, move)
 
 
-def planar_journey(shape, reach, obstacle, *kind, **constants):
+def planar_journey(shape, reach, obstacle, *kind, kp=30.0, **constants):
     avoidance, model = two_links(shape, reach, [obstacle], *kind, dt=2.0 * DT, **constants)
     ends, most = np.full(2, 3.0), np.full(2, 20.0)
     limits = JointLimits(tuple(model.names)[1:], -ends, ends, ends, -most, most)
-    return Journey(avoidance, limits, DT)
+    return Journey(avoidance, RobotModel(model, "fore", DT), limits, kp=kp)
 
 
 def test_random_goals_among_obstacles_keep_the_margin():
@@ -43,14 +42,7 @@ def test_random_goals_among_obstacles_keep_the_margin():
 @pytest.mark.parametrize("obstacles", [True, False])
 def test_the_hand_driven_into_the_arm_or_the_table_stops_before_it(obstacles):
     """Under torques held for a step, by forward dynamics, as a robot moves."""
-    arm, _, _ = panda(obstacles)
-    robot = RobotModel(arm.model, arm.frame, DT)
-
-    def move(q, v, a):
-        robot.update(State(q, v), a)
-        return arm.move(q, v, robot.torque(a), DT, 2)
-
-    _, trip = journey(DT, obstacles, move)
+    arm, trip = journey(obstacles, lambda q, v, step: arm.move(q, v, step.tau, DT, 2))
     goal = arm.q_start.copy()
     if obstacles:
         goal[1:4] = [1.5, 0.0, -0.6]  # stretched out, down through the table
@@ -67,10 +59,10 @@ def test_a_planar_arm_against_a_narrow_block_keeps_it_with_its_whole_length():
     """The rod is longer than the block: the closest point jumps between ends and edges."""
     rod = '<cylinder radius="0.03" length="0.5"/>'
     block = box("block", [0.75, 0.2, 0.0], [0.1, 0.1, 0.2])
-    trip = planar_journey(rod, 0.25, block, margin=0.01)
+    trip = planar_journey(rod, 0.25, block, kp=100.0, margin=0.01)
     q = np.zeros(2)
     for goal in ([0.6, -0.8], [-0.3, 1.2], [0.5, 0.5], [0.2, -0.1], [0.6, -1.4]):
-        q, _ = trip.go(q, np.array(goal), 1.2, kp=100.0)
+        q, _ = trip.go(q, np.array(goal), 1.2)
     assert min(trip.distances) > 0.01 + RESERVE - TOLERANCE
     assert sum(d < 0.015 for d in trip.distances) > 200
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import re
 
 import numpy as np
 import pytest
@@ -14,12 +13,9 @@ from controllers import make, posture_only
 
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.integral import make_integral
 from torque_safety_controller.qp import AccelerationRange
-from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 
@@ -88,21 +84,6 @@ GIVEN = {
     "friction_model_coulomb": COULOMB.tolist(),
     "friction_model_static": (1.3 * COULOMB).tolist(),
 }
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "allowed"),
-    [
-        ("friction_compensation", 1.1, ">= 0 and <= 1"),
-        ("friction_model_coulomb", [1.0] * (N - 1), f"{N} numbers"),
-        ("friction_model_static", [0.01] * N, "at least friction_model_coulomb"),
-        ("friction_model_stribeck_velocity", [0.0] * N, "> 0"),
-    ],
-)
-def test_what_cannot_be_is_refused_by_name(name, value, allowed):
-    given = read_config("panda", NODE) | GIVEN | {name: value}
-    with pytest.raises(SettingError, match=f"parameter '{name}' is .*{re.escape(allowed)}"):
-        read(ControllerConfiguration, given)
 
 
 def test_it_is_switched_while_the_node_runs(ros):

@@ -168,16 +168,3 @@ def test_the_torque_is_what_the_equations_say(tracking, method):
         a_last = step.a
     assert largest > 0.04
     assert cut > 0.02
-
-
-def test_coriolis_and_gravity_are_those_of_the_energies():
-    """And M' - 2 C is skew-symmetric, for the C that the controller uses."""
-    q, v = q_at(0.3), v_at(0.3)
-    robot = ARM.robot(0.0)
-    robot.rates = True
-    robot.update(State(q, v), np.zeros(N))
-    np.testing.assert_allclose(np.array(robot.h), coriolis(q, v) @ v + gravity(q), atol=1e-4)
-    np.testing.assert_allclose(robot.C @ v, coriolis(q, v) @ v, atol=1e-4)
-    M_dot = (masses(q + SMALL * v) - masses(q - SMALL * v)) / (2.0 * SMALL)
-    skew = M_dot - 2.0 * robot.C
-    np.testing.assert_allclose(skew, -skew.T, atol=1e-4)

@@ -103,13 +103,7 @@ def test_whatever_comes_the_torque_is_finite_and_within_the_budget(v, a):
     assert np.isfinite(usual).all()
 
 
-# Switching
-
-
-def test_off_it_adds_nothing_and_a_time_that_is_not_known_moves_nothing():
-    off = Friction(replace(FULL, scale=0.0))
-    assert off.idle
-    assert not off.torque(M2, np.ones(2), np.ones(2), DT, DT).any()
+def test_a_time_that_is_not_known_moves_nothing():
     compensation = started()
     before = compensation.torque(M2, np.full(2, 0.01), np.full(2, 3.0), DT, DT)
     after = compensation.torque(M2, np.full(2, 0.01), np.full(2, 50.0), 0.0, DT)
@@ -119,8 +113,10 @@ def test_off_it_adds_nothing_and_a_time_that_is_not_known_moves_nothing():
 def test_switching_and_new_coefficients_fade():
     v, a = np.array([0.5, -0.4]), np.array([2.0, -1.0])
     compensation = Friction(replace(FULL, scale=0.0))
+    assert compensation.idle
     other = FrictionModel(*np.array([[15.0, 0.2], [15.0, 0.2], [0.0, 3.0], [0.05, 0.002]]))
     taus = [compensation.torque(M2, v, a, DT, DT).copy()]
+    assert not taus[0].any()
     for settings_ in (
         FULL,
         replace(FULL, scale=0.2),
@@ -135,21 +131,7 @@ def test_switching_and_new_coefficients_fade():
         reached = np.minimum(settings_.scale * settings_.model.level(v), settings_.budget)
         np.testing.assert_allclose(taus[-1], np.sign(v) * reached, atol=0.03)
     # Of what changes, the budgets most, the share of a period in 0.2 s.
-    steps = np.abs(np.diff(taus, axis=0))
-    assert steps[:4500].max() < 17.0 * DT / 0.2
-    assert steps.max() < 40.0 * DT / 0.2
-    for _ in range(5000):
-        compensation.torque(M2, v, a, DT, DT)
-    assert compensation.idle
-
-
-def test_it_begins_with_nothing_and_fades_in():
-    v, a = np.array([0.5, -0.4]), np.zeros(2)
-    compensation = started(v=v)
-    assert np.abs(compensation.torque(M2, v, a, DT, DT)).min() > 0.9
-    compensation.reset()
-    first = compensation.torque(M2, v, a, DT, DT)
-    np.testing.assert_allclose(first, DT / 0.2 * np.sign(v) * MODEL.level(v), rtol=5e-3)
+    assert np.abs(np.diff(taus, axis=0)).max() < 40.0 * DT / 0.2
 
 
 # One joint that sticks and slips
@@ -204,9 +186,6 @@ def test_believing_too_much_needs_the_memory_that_the_damping_allows():
     assert friction_joint(2.0, 100.0)[1] > 0.05
     # With no more than there is, any memory is fine.
     assert friction_joint(0.77, 100.0)[1] < STILL
-
-
-# Lyapunov
 
 
 def lyapunov(x, v, w, M, kp, kd, theta, limit):

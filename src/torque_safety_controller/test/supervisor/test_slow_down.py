@@ -36,15 +36,6 @@ def test_the_share_falls_in_a_twentieth_of_a_second_and_rises_in_half_of_one():
     assert rising[-1] == 1.0
 
 
-def test_it_falls_by_all_of_the_time_that_has_gone_by_and_rises_by_a_period():
-    ramp = Ramp(DT)
-    ramp.fall()
-    ramp.advance(0.1, at_rest=False)
-    assert ramp.share == 0.0
-    ramp.advance(1.0, at_rest=True)
-    assert ramp.share == pytest.approx((DT / 0.5) ** 2)
-
-
 def test_an_arm_that_does_not_come_to_rest_goes_on_after_a_second_but_not_while_it_is_to_wait():
     ramp = Ramp(DT)
     ramp.fall(at_once=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms among obstacles, and a small QP that moves them, for tests of the collision avoidance."""
+"""Arms among obstacles, for tests of the collision avoidance."""
 
 from __future__ import annotations
 
@@ -8,16 +8,23 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 from arms import Arm, load_arm
-from proxsuite import proxqp
+from controllers import posture_only
 
+from torque_safety_controller.controller import Controller
 from torque_safety_controller.new_robot.capsules import link_capsules
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts.collision.avoidance import Collision, CollisionRows
+from torque_safety_controller.parts.collision.avoidance import Collision
 from torque_safety_controller.parts.collision.model import CollisionModel, build_collision_model
 from torque_safety_controller.parts.collision.shapes import Shape, capsule, make_obstacle
+from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.joint_bounds import JointBounds
+from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot.description import build_model, load_geometry
+from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.viability import BoundsSolver
 
@@ -63,30 +70,6 @@ _TWO_LINKS = """<robot name="two_links">
 </robot>"""
 
 
-def two_links(
-    shape: str, reach: float, obstacles, kind="revolute", axis="0 0 1", dt=1e-3, **constants
-) -> tuple[Collision, pin.Model]:
-    """Return an arm in the x-y plane whose forearm has one collision shape, 20 rad/s^2 a joint."""
-    urdf = _TWO_LINKS.format(shape=shape, reach=reach, kind=kind, axis=axis)
-    model = build_model(urdf, ["shoulder", "elbow"])
-    capsules = link_capsules(model, load_geometry(urdf, model))
-    collision = build_collision_model(
-        model,
-        [capsule("fore", *each) for each in capsules["fore"]],
-        np.zeros(2),
-        obstacles,
-    )
-    limit = np.full(2, 20.0)
-    return with_constants(Collision(collision, -limit, limit, dt), **constants), model
-
-
-def with_constants(avoidance: Collision, **constants: float) -> Collision:
-    """Change what no setting reaches, to see more in a test."""
-    for name, value in constants.items():
-        setattr(avoidance, name, value)
-    return avoidance
-
-
 @cache
 def panda(obstacles: bool = True) -> tuple[Arm, JointLimits, CollisionModel]:
     """Return Panda with its limits and its collision model."""
@@ -106,15 +89,44 @@ def panda(obstacles: bool = True) -> tuple[Arm, JointLimits, CollisionModel]:
     return arm, limits, collision
 
 
+def two_links(
+    shape: str, reach: float, obstacles, kind="revolute", axis="0 0 1", dt=1e-3, **constants
+) -> tuple[Collision, pin.Model]:
+    """Return an arm in the x-y plane whose forearm has one collision shape, 20 rad/s^2 a joint.
+
+    Args:
+        shape: of the forearm, as in a URDF.
+        reach: where its middle is from the elbow, m.
+        obstacles: around it.
+        kind: of the second joint.
+        axis: of that.
+        dt: how long an acceleration is held, s.
+        constants: attributes of `Collision` to change.
+    """
+    urdf = _TWO_LINKS.format(shape=shape, reach=reach, kind=kind, axis=axis)
+    model = build_model(urdf, ["shoulder", "elbow"])
+    capsules = link_capsules(model, load_geometry(urdf, model))
+    links = [capsule("fore", *each) for each in capsules["fore"]]
+    collision = build_collision_model(model, links, np.zeros(2), obstacles)
+    limit = np.full(2, 20.0)
+    return with_constants(Collision(collision, -limit, limit, dt), **constants), model
+
+
+def with_constants(avoidance: Collision, **constants: float) -> Collision:
+    for name, value in constants.items():
+        setattr(avoidance, name, value)
+    return avoidance
+
+
+def panda_avoidance(**constants: float) -> Collision:
+    """Panda among all obstacles."""
+    _, limits, collision = panda()
+    return with_constants(Collision(collision, limits.a_min, limits.a_max, 2e-3), **constants)
+
+
 def everything() -> Collision:
     """Panda among all obstacles, near and far."""
-    return with_constants(panda_avoidance(1000), influence=5.0)
-
-
-def panda_avoidance(rows_max: int) -> Collision:
-    _, limits, collision = panda()
-    avoidance = Collision(collision, limits.a_min, limits.a_max, 2e-3)
-    return with_constants(avoidance, rows_max=rows_max)
+    return panda_avoidance(rows_max=1000, influence=5.0)
 
 
 def random_states(count, speed=1.0, seed=0):
@@ -129,59 +141,38 @@ def wide_rows(avoidance, q, v):
     return avoidance.rows(q, v, -wide, wide)
 
 
-def least_relaxed(
-    a_des: np.ndarray, a_lower: np.ndarray, a_upper: np.ndarray, rows: CollisionRows
-) -> np.ndarray:
-    """Return the accelerations nearest to those wanted; rows give way only to the bounds."""
-    n, k = len(a_des), len(rows.lower)
-    nearest = np.clip(a_des, a_lower, a_upper)
-    if not k or (rows.G @ nearest >= rows.lower).all():
-        return nearest
-    H = np.diag(np.r_[np.ones(n), np.full(k, 1e-6)])
-    C = np.hstack([rows.G, np.eye(k)])
-    qp = proxqp.dense.QP(n + k, 0, k, True)
-    qp.settings.eps_abs, qp.settings.eps_rel = 1e-8, 0.0
-    free = np.full(k, np.inf)
-    qp.init(
-        H,
-        np.r_[-a_des, np.full(k, 1e4)],
-        None,
-        None,
-        C,
-        rows.lower.copy(),
-        free,
-        np.r_[a_lower, np.zeros(k)],
-        np.r_[a_upper, free],
-    )
-    qp.solve()
-    return np.clip(qp.results.x[:n], a_lower, a_upper)
-
-
 class Journey:
     """An arm on its way to joint goals, kept inside its bounds and away from everything.
 
     Args:
-        avoidance: rows; None to do without.
+        avoidance: the part under test.
+        robot: model of the arm.
         limits: of the joints.
-        dt: control period, s; the bounds look two of them ahead.
-        move: (q, v, a) -> the next state; None: constant acceleration.
+        move: (q, v, step) -> the next state; None: the accelerations chosen.
+        kp: stiffness towards the goals, 1/s^2.
     """
 
-    def __init__(self, avoidance, limits: JointLimits, dt: float, move=None) -> None:
-        self.avoidance, self.dt = avoidance, dt
-        self._bounds = BoundsSolver(limits, 2.0 * dt, period=dt)
-        self._move = move or (lambda q, v, a: (q + v * dt + 0.5 * a * dt * dt, v + a * dt))
+    def __init__(
+        self, avoidance: Collision, robot: RobotModel, limits: JointLimits, move=None, kp=30.0
+    ) -> None:
+        self.avoidance, self._dt = avoidance, robot.dt
+        self._bounds = BoundsSolver(limits, 2.0 * robot.dt, period=robot.dt)
+        self._move = move or (lambda q, v, step: State(q, v).after(step.a, robot.dt))
+        goals = Goals(robot.n, posture_only(kp, critical_damping(kp)))
+        parts = [goals, JointBounds(), avoidance]
+        self._controller = Controller(robot, parts, np.full(robot.n, 1e4))
         self.distances: list[float] = []
         self.viable: list[bool] = []
 
-    def go(self, q: np.ndarray, goal: np.ndarray, duration: float, kp: float = 30.0):
+    def go(self, q: np.ndarray, goal: np.ndarray, duration: float):
         """Return the state after a while, from rest at q."""
         v = np.zeros(len(q))
-        for _ in range(round(duration / self.dt)):
+        self._controller.reset(q)
+        self._controller.goals.set_posture(goal)
+        for _ in range(round(duration / self._dt)):
             lower, upper, _ = self._bounds.bounds(q, v)
-            rows = self.avoidance.rows(q, v, lower, upper)
+            step = self._controller.step(State(q, v), AccelerationRange(lower, upper))
             self.distances.append(self.avoidance.closest()[0])
-            self.viable.append(bool(rows.viable.all()))
-            a = least_relaxed(kp * (goal - q) - 2.0 * np.sqrt(kp) * v, lower, upper, rows)
-            q, v = self._move(q, v, a)
+            self.viable.append(self.avoidance.viable)
+            q, v = self._move(q, v, step)
         return q, v
