@@ -29,7 +29,7 @@ EXACT = 1e-6
 EDGE = 1e-6
 """Margin within which viable states are not told from others."""
 
-TOLERANCE, VIABLE, ROUNDS = 1e-10, 1e-8, 400
+TOLERANCE, VIABLE, WEIGHT, ROUNDS = 1e-10, 1e-8, 1e-7, 400
 
 
 class Comparison(NamedTuple):
@@ -94,10 +94,9 @@ class _Motions:
     """m motions side by side; variables of each: N accelerations, a margin, N margins of steps.
 
     The margins are what position and speed keep from their limits, everywhere and in one step.
-    To look for the extreme first acceleration they are zero; but of the motions that reach the
-    extreme, one that keeps clear of the limits where it can is examined for times at which it
-    leaves the range. Without that, the exchange would waste its rounds on corners that the
-    motion need not touch.
+    For the extreme first acceleration they are zero. But of motions that reach the extreme, one
+    is preferred, by a weight that does not matter, that keeps clear of the limits where it can.
+    Without that, the exchange would waste its rounds on corners that the motion need not touch.
     """
 
     def __init__(self, case, q, v):
@@ -114,76 +113,63 @@ class _Motions:
 
     def margin(self):
         """Return the margin that can be kept for ever; negative if the limits cannot."""
-        margin, active = np.full(self.m, np.nan), np.arange(self.m)
-        for _ in range(ROUNDS):
-            x = self._solve(active, "margin")
-            margin[active] = x[:, self.steps]
-            # What some of the times already rule out, all of them rule out.
-            finished = self._add_cuts(x, active) | (margin[active] < -VIABLE)
-            active = active[~finished]
-            if active.size == 0:
-                return margin
-        margin[active] = np.nan
-        return margin
+        cost, bounds = self._free()
+        cost[self.steps] = -1.0
+        bounds[self.steps] = (-np.inf, 1.0)
+        return self._exchange(cost, bounds)[:, self.steps]
 
     def extreme(self, sign):
         """Return the largest (or, with sign -1, the smallest) first acceleration, rad/s^2."""
-        extreme, active = np.full(self.m, np.nan), np.arange(self.m)
-        for _ in range(ROUNDS):
-            first = self._solve(active, "first", sign)[:, 0]
-            active, first = active[np.isfinite(first)], first[np.isfinite(first)]
-            x = self._solve(active, "clear", sign, first)
-            finished = self._add_cuts(x, active)
-            extreme[active] = np.where(finished & np.isfinite(x[:, 0]), first, np.nan)
-            active = active[~finished]
-            if active.size == 0:
-                break
-        return extreme * self.unit
+        cost, bounds = self._free()
+        cost[0] = -sign
+        cost[self.steps + 1 :] = -WEIGHT
+        bounds[self.steps + 1 :] = (-1e-9, 0.01)
+        return self._exchange(cost, bounds)[:, 0] * self.unit
 
-    def _solve(self, active, goal, sign=1.0, first=None):
-        """Return the best variables of the active motions, shape (k, 2 N + 1)."""
-        if active.size == 0:
-            return np.empty((0, 2 * self.steps + 1))
-        cost = np.zeros((active.size, 2 * self.steps + 1))
-        bounds = np.zeros((*cost.shape, 2))
-        bounds[:, : self.steps] = self.bounds
-        if goal == "first":
-            cost[:, 0] = -sign
-        elif goal == "margin":
-            cost[:, self.steps] = -1.0
-            bounds[:, self.steps] = (-np.inf, 1.0)
-        else:
-            bounds[:, 0] = first[:, None]
-            cost[:, self.steps + 1 :] = -1.0
-            bounds[:, self.steps + 1 :] = (-1e-9, 1.0)
+    def _free(self):
+        """Return a cost of nothing, and bounds of accelerations alone."""
+        bounds = np.zeros((2 * self.steps + 1, 2))
+        bounds[: self.steps] = self.bounds
+        return np.zeros(2 * self.steps + 1), bounds
+
+    def _exchange(self, cost, bounds):
+        """Return the best variables of all motions, shape (m, 2 N + 1)."""
+        best, active = np.full((self.m, cost.size), np.nan), np.arange(self.m)
+        for _ in range(ROUNDS):
+            best[active] = x = self._solve(active, cost, bounds)
+            # What some of the times already rule out, all of them rule out.
+            ended = np.isnan(x[:, 0]) | (x[:, self.steps] < -VIABLE)
+            active = active[~(self._add_cuts(x, active) | ended)]
+            if active.size == 0:
+                return best
+        best[active] = np.nan
+        return best
+
+    def _solve(self, active, cost, bounds):
+        """Return the best variables of the active motions, with the limits at some times."""
+        k, width = active.size, cost.size
         matrix, rhs = self._rows(active)
-        at_rest = np.zeros(cost.shape)
+        at_rest = np.zeros((k, width))
         at_rest[:, : self.steps] = 1.0
-        tight = dict.fromkeys(
-            ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), 1e-10
-        )
+        tight = ("primal_feasibility_tolerance", "dual_feasibility_tolerance")
         for attempt in ({}, {"presolve": False}):
             result = linprog(
-                cost.ravel(),
+                np.tile(cost, k),
                 A_ub=matrix,
                 b_ub=rhs,
                 A_eq=self._sparse(at_rest, active, active),
                 b_eq=-self.v[active],
-                bounds=bounds.reshape(-1, 2),
+                bounds=np.tile(bounds, (k, 1)),
                 method="highs",
-                options={**tight, **attempt},
+                options={**dict.fromkeys(tight, TOLERANCE), **attempt},
             )
             if result.status == 0:
-                return result.x.reshape(cost.shape)
-        if active.size == 1:
-            return np.full(cost.shape, np.nan)
+                return result.x.reshape(k, width)
+        if k == 1:
+            return np.full((1, width), np.nan)
         # At such tolerances the solver gives up now and then: find the motion it is about.
-        halves = np.array_split(np.arange(active.size), 2)
-        parts = [
-            self._solve(active[half], goal, sign, None if first is None else first[half])
-            for half in halves
-        ]
-        return np.concatenate(parts)
+        halves = np.array_split(active, 2)
+        return np.concatenate([self._solve(half, cost, bounds) for half in halves])
 
     def _add_cuts(self, x, active):
         """Add the times at which motions leave the range; return which of them do not."""
