@@ -12,7 +12,6 @@ from viability_bounds_pkg.baselines import (
     rubrecht_bounds,
     rubrecht_velocity_range,
 )
-from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import acceleration_bounds, viable_velocity_range
 
 FIGURE_1 = one_joint(-1.0, 1.0, 5.0, -15.0, 15.0)
@@ -29,15 +28,6 @@ def test_bounds_are_ordered_and_within_the_acceleration_limits(method):
     assert (lower <= upper).all()
     assert (upper <= ASYMMETRIC.a_max).all()
     assert viable.any() and not viable.all()
-
-
-@pytest.mark.parametrize("method", [naive_bounds, decre_bounds, rubrecht_bounds])
-def test_continuous_joints_have_no_position_bounds(method):
-    inf = np.inf
-    limits = JointLimits(["a", "b"], [-1.0, -inf], [1.0, inf], [2.0, 2.0], [-9.0] * 2, [8.0] * 2)
-    lower, upper, viable = method([0.0, 70.0], [0.0, 1.0], limits, 0.01)
-    assert viable.tolist() == [True, True]
-    assert (lower[1], upper[1]) == (-9.0, 8.0)
 
 
 def test_naive_bounds_are_equation_2():

@@ -47,24 +47,6 @@ def test_the_bounds_are_those_of_the_worst_states_within_the_errors(name, margin
     np.testing.assert_allclose(bounds.lower[both], below.lower[both], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["asymmetric", "no lower limit"])
-def test_joints_count_as_outside_only_where_no_state_within_the_errors_is_viable(name):
-    case, errors = HOLDING[name], errors_of(HOLDING[name])
-    known, unsure = solver_of(case), solver_of(case, **errors)
-    off, error = map(np.array, errors.values())
-    q, v = (1.05 * x for x in states_of(case, 2000, seed=3))
-    viable = unsure.bounds(q, v).viable
-    assert (~viable).any()
-    for x in np.linspace(-1.0, 1.0, 9):
-        for y in np.linspace(-1.0, 1.0, 9):
-            inside = known.bounds(q + x * off, v + y * error).viable
-            assert not (inside & ~viable).any()
-    q_max, v_max = case[1:3]
-    assert unsure.bounds([q_max + 0.999 * off[0]], [0.0]).viable[0]
-    assert not unsure.bounds([q_max + 1.001 * off[0]], [0.0]).viable[0]
-    assert not unsure.bounds([0.0], [v_max + 1.001 * error[0]]).viable[0]
-
-
 @pytest.mark.parametrize("share", [0.01, 0.05])
 @pytest.mark.parametrize("name", CASES)
 def test_a_step_from_within_the_kernel_stays_in_it_at_all_times(name, share):

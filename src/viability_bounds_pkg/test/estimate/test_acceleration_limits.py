@@ -19,9 +19,7 @@ from estimated_models import (
 from viability_bounds_pkg.acceleration_limits import (
     EmptyIntervalError,
     estimate_acceleration_limits,
-    largest_velocity_scale,
     limits_in_share,
-    unavailable_share,
 )
 from viability_bounds_pkg.estimate.worst_case import (
     LimitEstimateError,
@@ -158,18 +156,6 @@ def test_limits_of_a_share_are_available_in_as_many_other_states():
     np.testing.assert_allclose(available / count, share, atol=0.03)
 
 
-def test_an_override_is_reported_with_the_share_of_states_that_do_not_allow_it():
-    model = baxter()
-    space = StateSpace.of(model, *limits_of(model))
-    overrides = {"left_s1": (-3.0, 3.0)}
-    limits = estimate_acceleration_limits(
-        model, *limits_of(model), 5000, method="refined", overrides=overrides
-    )
-    share = unavailable_share(model, space, limits)
-    assert 0.15 < share[1] < 0.25
-    np.testing.assert_array_equal(np.delete(share, 1), 0.0)
-
-
 def test_gravity_beyond_the_torque_is_named():
     """What too much speed gives, see `test_estimate_executable`."""
     with pytest.raises(EmptyIntervalError) as raised:
@@ -178,12 +164,6 @@ def test_gravity_beyond_the_torque_is_named():
     assert "lower velocities do not help" in str(raised.value)
     assert "takes 9.81 N m just to hold still" in str(raised.value)
     assert "\n" not in str(raised.value)
-
-
-def test_with_torque_enough_velocities_need_not_be_scaled():
-    model = pendulum(links=2, joint_type="revolute")
-    space = StateSpace.of(model, [-3, -3], [3, 3], [8.0, 8.0], [600.0, 300.0])
-    assert largest_velocity_scale(model, space).scale == 1.0
 
 
 @pytest.mark.parametrize(

@@ -126,19 +126,12 @@ def drive(solver, q, v, steps, rng, time=None, w=0.0):
 
 
 class Returned(NamedTuple):
-    """How motions from outside the kernel went.
+    """How motions from outside the kernel went; rad and rad/s."""
 
-    Attributes:
-        stray: joints that did not get back.
-        again: largest violation of a limit by a joint that had been back, rad and rad/s.
-        position: the furthest that any went beyond where braking at its limit takes it, rad.
-        speed: the most that any was faster than at the start or than its limit, rad/s.
-    """
-
-    stray: int
-    again: float
-    position: float
-    speed: float
+    stray: int  # joints that did not get back
+    again: float  # largest violation of a limit by a joint that had been back
+    position: float  # the furthest that any went beyond where braking at its limit takes it
+    speed: float  # the most that any was faster than at the start or than its limit
 
 
 def bring_back(solver, q, v, most_steps, rng):
