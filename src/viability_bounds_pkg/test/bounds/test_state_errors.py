@@ -47,17 +47,21 @@ def test_the_bounds_are_those_of_the_worst_states_within_the_errors(name, margin
     np.testing.assert_allclose(bounds.lower[both], below.lower[both], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("share", [0.01, 0.05])
+@pytest.mark.parametrize(
+    ("share", "margin", "period"),
+    [(0.0, 0.0, 1.0), (0.0, 0.3, 0.5), (0.01, 0.02, 1.0), (0.05, 0.02, 1.0)],
+)
 @pytest.mark.parametrize("name", CASES)
-def test_a_step_from_within_the_kernel_stays_in_it_at_all_times(name, share):
-    """The state that is told being anywhere within the errors, most often at a corner."""
-    case, errors, margin = CASES[name], errors_of(CASES[name], share), 0.02
+def test_a_step_from_within_the_kernel_stays_in_it_at_all_times(name, share, margin, period):
+    """The state that is told is anywhere within the errors, most often at a corner."""
+    case, errors = CASES[name], errors_of(CASES[name], share)
     try:
-        solver = solver_of(case, margin, **errors)
+        solver = solver_of(case, margin, period, **errors)
     except JointLimitsError:
-        assert name in ("far too narrow", "narrow and too fast")
+        assert share or margin  # what is uncertain throws the joint out within a few steps
+        assert name not in ROOMY
         return
-    limits, dt, rng = solver.limits, case[5], np.random.default_rng(4)
+    limits, rng = solver.limits, np.random.default_rng(4)
     q, v = states_in_kernel(solver, case, 20_000, rng)
     told = [
         x + error * np.clip(rng.uniform(-3.0, 3.0, q.shape), -1.0, 1.0)
@@ -67,7 +71,7 @@ def test_a_step_from_within_the_kernel_stays_in_it_at_all_times(name, share):
     assert bounds.viable.all()
     w = margin * min(-case[3], case[4])
     for a in (bounds.lower - w, bounds.upper + w):
-        for t in (0.1 * dt, 0.4 * dt, 0.7 * dt, dt):
+        for t in np.array([0.1, 0.4, 0.7, 1.0]) * min(solver.steps[0], period * case[5]):
             end, speed = q + t * v + 0.5 * t**2 * a, v + t * a
             inside = np.clip(end, limits.q_min, limits.q_max)
             assert np.abs(end - inside).max() <= 1e-12 * max(1.0, np.abs(q).max())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bounds keep the limits: in motion, under disturbances, and on the way back from outside."""
+"""The bounds keep the limits, in motion and on the way back from outside."""
 
 import numpy as np
 import paper_algorithms
@@ -22,14 +22,14 @@ from viability_bounds_pkg.viability import BoundsSolver
 CASES = {**CASES, **ODD_STEPS}
 
 
+@pytest.mark.parametrize("shortest", [1.0, 0.05], ids=["of full length", "cut short"])
 @pytest.mark.parametrize("name", CASES)
-def test_limits_hold_for_ever(name):
-    """Half a million steps, of the length the bounds are for or of any shorter one."""
+def test_limits_hold_for_ever(name, shortest):
+    """In steps of the length that the bounds are for, or of any shorter one."""
     solver, rng = solver_of(CASES[name]), np.random.default_rng(1)
-    for time in (None, lambda: solver.steps * rng.uniform(0.05, 1.0)):
-        seen = drive(solver, *states_in_kernel(solver, CASES[name], 600, rng), 50, rng, time)
-        assert seen.lost == 0
-        assert seen.worst <= VIOLATION
+    seen = drive(solver, *states_in_kernel(solver, CASES[name], 600, rng), 50, rng, shortest)
+    assert seen.lost == 0
+    assert seen.worst <= VIOLATION
 
 
 @pytest.mark.parametrize("name", ["too fast", "narrow"])
@@ -65,29 +65,6 @@ def test_limits_hold_while_the_step_changes(name, share):
         q, v, low, high = advance(q, v, a, dt)
         seen.see(low, high, v)
     assert seen.worst <= VIOLATION
-
-
-@pytest.mark.parametrize(("share", "period"), [(0.02, 1.0), (0.3, 0.5)])
-@pytest.mark.parametrize("name", CASES)
-def test_a_margin_holds_against_any_disturbance(name, share, period):
-    case, rng = CASES[name], np.random.default_rng(5)
-    w, dt = share * min(-case[3], case[4]), case[5]
-    try:
-        solver = solver_of(case, share, period)
-    except JointLimitsError:
-        # Then indeed the disturbance alone can throw the joint out within a few steps.
-        assert w * dt > 0.1 * min(case[2], (case[1] - case[0]) / dt)
-        return
-    states = states_in_kernel(solver, case, 480, rng)
-    seen = drive(solver, *states, 25, rng, lambda: period * dt, w)
-    assert seen.lost == 0
-    assert seen.worst <= VIOLATION
-
-
-def test_without_a_margin_the_disturbance_breaks_the_limits():
-    case, rng = CASES["figure 3"], np.random.default_rng(6)
-    solver = solver_of(case)
-    assert drive(solver, *states_in_kernel(solver, case, 480, rng), 25, rng, w=0.2).worst > 1e-3
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.05])

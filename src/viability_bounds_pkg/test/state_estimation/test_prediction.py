@@ -62,7 +62,7 @@ def errors(ours, dt, delay, lag=0.0, start=MOVING, steps=30, missed=(), coarse=0
         told, effort = arm.state, arm.tau
         if coarse:
             told = State(coarse * np.rint(told.q / coarse), np.zeros(N))
-            if k > delay + 1:  # before, the effort alone tells the torque
+            if k > 10:  # at first the effort alone tells the torque
                 effort = effort + 0.01 * MAX * np.clip(rng.standard_normal(N), -3, 3)
         stamp = round(1e9 * k * dt)
         predicted.append(ours.step(stamp, told, effort))

@@ -111,27 +111,6 @@ def test_an_adversary_of_accelerations_within_the_margin_passes_no_limit(panda, 
         assert (np.abs(v) <= panda.margin / 30.0).all()
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_motors_with_a_lag_pass_no_limit_where_the_law_knows_it(talos, told):
-    rng = np.random.default_rng(0)
-    lag = np.full(talos.n, 1.0 / (2.0 * np.pi * 50.0))  # s
-    share = -np.expm1(-H / lag)  # of the way to a new torque in a step
-    stop = talos.stop(motor_lag=lag)
-    for _ in range(3):
-        q, v = talos.edge(rng)
-        tau = pin.rnea(talos.model, talos.data, q, v, np.zeros(talos.n)).copy()
-        stop.start(q, v)
-        for _ in range(round((stop.time_to_rest(v) + 0.2) / H)):
-            asked = stop.torque(q, v, tau if told else None)
-            before = tau
-            tau = tau + share * (asked - tau)
-            q, v = talos.move(q, v, asked + (before - asked) * lag / H * share)
-            assert talos.beyond(q).max() <= (0.0 if told else 1e-4)
-            assert (np.abs(v) <= talos.limits.v_max).all()
-        assert stop.at_rest
-        assert np.abs(v).max() < 5e-3
-
-
 @pytest.mark.parametrize("options", [{"observer_time": 0.002}, {}])
 def test_only_with_the_observer_it_rests_under_torques_that_the_model_does_not_know(
     panda, options

@@ -41,15 +41,6 @@ def choose(q, v, lower, upper, limits, rng):
     return np.choose(np.arange(len(q))[:, None] % len(ways), ways)
 
 
-def stray(v, w, rng):
-    """Return errors of the acceleration up to w; six motions stray alike, the next six otherwise.
-
-    So they meet all ways to `choose`.
-    """
-    ways = [w + 0.0 * v, -w + 0.0 * v, w * np.sign(v), w * rng.choice([-1.0, 1.0], v.shape)]
-    return np.choose(np.arange(len(v))[:, None] // 6 % len(ways), ways)
-
-
 class Violations:
     """Largest violations of the limits seen, rad and rad/s; states lost from the kernel."""
 
@@ -102,7 +93,7 @@ def states_outside(solver, case, count, rng):
     return q[outside][:count], v[outside][:count]
 
 
-def drive(solver, q, v, steps, rng, time=None, w=0.0):
+def drive(solver, q, v, steps, rng, shortest=1.0):
     """Let joints that are in the kernel choose among the bounds; return what was violated.
 
     Args:
@@ -110,18 +101,15 @@ def drive(solver, q, v, steps, rng, time=None, w=0.0):
         q, v: states to start from.
         steps: their number.
         rng: random generator.
-        time: returns how long each step takes, s; as long as the bounds are for, if not given.
-        w: by how much accelerations differ from those chosen, changing within a step, rad/s^2.
+        shortest: each step ends after a share of the time that the bounds are for, at least this.
     """
     seen = Violations(solver.limits)
     for _ in range(steps):
         lower, upper, viable = solver.bounds(q, v)
         seen.lost += int((~viable).sum())
         a = choose(q, v, lower, upper, solver.limits, rng)
-        duration = solver.steps if time is None else time()
-        for part in (0.4, 0.1, 0.5) if w else (1.0,):
-            q, v, low, high = advance(q, v, a + stray(v, w, rng), part * duration)
-            seen.see(low, high, v)
+        q, v, low, high = advance(q, v, a, solver.steps * rng.uniform(shortest, 1.0))
+        seen.see(low, high, v)
     return seen
 
 
