@@ -55,23 +55,6 @@ def test_velocity_ranges_are_inside_the_kernel(limits):
         assert velocity_range(q, limits, 1e-9)[1] == pytest.approx(kernel[1], abs=1e-6)
 
 
-def hardest_braking(velocity_range, dt=0.01):
-    """Return the deceleration asked for of a joint that always goes as fast as allowed."""
-    hardest = q = v = 0.0
-    for _ in range(500):
-        allowed = float(velocity_range([q], FIGURE_1, dt)[1][0])
-        hardest = max(hardest, (v - allowed) / dt)
-        v = min(allowed, v + FIGURE_1.a_max[0] * dt)
-        q += dt * v
-        assert q <= FIGURE_1.q_max[0] + 1e-9
-    return hardest
-
-
-def test_decre_contradicts_itself_near_the_limit_and_rubrecht_does_not():
-    assert hardest_braking(decre_velocity_range) > 1.1 * 15.0
-    assert hardest_braking(rubrecht_velocity_range) <= 15.0 + 1e-6
-
-
 def pull_to_the_limit(bounds, dt_bounds=0.01, dt=0.01):
     """The test of Fig. 4: a PD controller whose goal is 0.1 rad beyond the upper limit, 2 s long.
 

@@ -8,7 +8,6 @@ from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.node.bounds_parameters import (
     BoundsConfiguration,
     make_bounds,
-    make_solver,
 )
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.testing.ros_harness import read_config
@@ -65,16 +64,6 @@ def test_each_declaration_takes_something(name, more):
         np.testing.assert_array_equal(left, whole)  # the observer's own error counts
     else:
         assert (left > whole).all()
-
-
-@pytest.mark.parametrize("missed", [0, 2])
-def test_bounds_that_look_far_ahead_give_way_to_what_commands_act_for(missed):
-    """But no further: a command may act for as long as a row of missed deadlines."""
-    config = configured(missed_deadlines=missed, bounds_dt_factor=100.0)
-    solver = make_solver(config)
-    assert (solver.steps >= (1 + missed) * config.dt).all()
-    assert (solver.steps < config.horizon).any()
-    assert solver.exact.all()
 
 
 @pytest.mark.parametrize(

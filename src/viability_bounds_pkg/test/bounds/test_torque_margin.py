@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from adversary import advance
 
 from viability_bounds_pkg.bounds.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.joint_limits import JointLimits
@@ -36,15 +37,11 @@ def excess_in_units_of_d(rng, limits, dt, jerk, margins, factor):
         target *= np.where(rng.random(JOINTS) < 0.01, -1.0, 1.0)
         a = np.where(target > 0.0, bounds.upper, bounds.lower)
         outward = np.where(rng.random(JOINTS) < 0.8, target, rng.choice([-1.0, 1.0], JOINTS))
-        turn = np.clip(np.divide(-v, a, out=np.zeros(JOINTS), where=a != 0.0), 0.0, dt)
-        ends = q + dt * v + 0.5 * dt**2 * a
-        extremes = q + turn * v + 0.5 * turn**2 * a
-        high = np.maximum(ends, extremes) + position_error - limits.q_max
-        low = limits.q_min - np.minimum(ends, extremes) + position_error
-        excess = max(excess, np.max(np.maximum(high, low) / position_error))
-        speed = max(speed, np.max(np.abs(v + dt * a) + velocity_error - limits.v_max))
-        q = ends + position_error * outward
-        v = v + dt * (a + mean_error * outward)
+        q, v, low, high = advance(q, v, a, dt)
+        beyond = np.maximum(high - limits.q_max, limits.q_min - low) + position_error
+        excess = max(excess, np.max(beyond / position_error))
+        speed = max(speed, np.max(np.abs(v) + velocity_error - limits.v_max))
+        q, v = q + position_error * outward, v + dt * mean_error * outward
     return excess, speed
 
 

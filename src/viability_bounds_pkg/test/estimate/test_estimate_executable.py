@@ -85,17 +85,6 @@ def test_limits_of_the_parameter_file_beat_those_of_the_urdf(write_robot, call):
     assert limits["acceleration_min"][0] == pytest.approx(-at_rest, rel=0.05)
 
 
-def test_locked_joints(write_robot, call):
-    path = write_robot()
-    lines = path.read_text().replace("acceleration_min: [-1.0, -1.0]", "acceleration_min: [-1.0]")
-    found = []
-    for angle in (0.0, 3.0):  # the hand stretched out, and folded back
-        locked = f"joints: [shoulder]\n    locked_joints: [wrist]\n    locked_positions: [{angle}]"
-        path.write_text(lines.replace("joints: [shoulder, wrist]", locked))
-        found.append(printed(call(path, "--samples", 300))["acceleration_max"][0])
-    assert found[1] > 1.1 * found[0]
-
-
 def test_gravity_beyond_the_torque(write_robot, call, tmp_path):
     output = tmp_path / "limits.yaml"
     path = write_robot(parameters="    torque_max: [5.0, 30.0]")

@@ -37,16 +37,9 @@ MOVING = State(STILL.q, np.array([0.3, -0.4, 0.5, 0.3, -0.6, 0.5, 0.7]))
 def errors(ours, dt, delay, lag=0.0, start=MOVING, steps=30, missed=(), coarse=0.0, w=0.0):
     """Return the largest errors of the predicted states of an arm that takes random torques.
 
-    Args:
-        ours: the estimator.
-        dt: control period, s.
-        delay: in periods.
-        lag: of the motors, s.
-        start: state at the beginning.
-        steps: states to predict.
-        missed: those whose commands never come.
-        coarse: resolution of the encoders, rad; effort has noise, and velocities are zero, then.
-        w: size of an acceleration that the model does not know, rad/s^2.
+    `missed` are states whose commands never come, `coarse` is the resolution of the encoders, rad:
+    velocities are not told then, and efforts have noise. `w` is the size of an acceleration that
+    the model does not know, rad/s^2.
     """
     rng = np.random.default_rng(3)
     # Torques around those that hold the arm, that change as quickly whatever the period is.
@@ -137,13 +130,13 @@ def test_states_pass_unchanged_where_nothing_is_declared():
 # Which torque acted
 
 
-def standing(delay=0, observers=OBSERVERS, periods=5):
+def standing(delay=0, observers=OBSERVERS):
     """Return an estimator of an arm that commands hold, their torque, and the next period."""
     ours, tau = estimator(delay, observers=observers), gravity(STILL)
-    for k in range(1, 1 + periods):
+    for k in range(1, 6):
         ours.step(k * PERIOD_NS, STILL, tau)
         ours.answer(k * PERIOD_NS, tau)
-    return ours, tau, 1 + periods
+    return ours, tau, 6
 
 
 @pytest.mark.parametrize(
@@ -169,13 +162,6 @@ def test_the_torque_believed_is_the_command_unless_the_effort_disproves_it(
 
     assert speed(command, effort) == pytest.approx(speed(believed, believed), abs=1e-9)
     assert speed(1.0, 1.0) > 0.01
-
-
-@pytest.mark.parametrize(("quiet", "believed"), [(2, False), (300, True)])
-def test_the_quieter_the_effort_the_less_it_must_differ_to_be_believed(quiet, believed):
-    ours, tau, k = standing(periods=5 + quiet)
-    answer = ours.step(k * PERIOD_NS, STILL, tau + 0.5 * PUSH)  # 6 % of torque_max
-    assert (answer.v[0] > 1e-3) == believed
 
 
 def test_drives_that_control_positions_hold_the_torque_that_they_report():

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pinocchio as pin
+from true_arm import runge_kutta
 
 from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.joint_limits import JointLimits
@@ -49,17 +50,8 @@ class Arm:
         return middle, rng.uniform(-0.1, 0.1, self.n) * self.limits.v_max
 
     def move(self, q, v, tau):
-        """The state after a step under a held torque, by the classical Runge-Kutta method."""
-
-        def slope(q, v):
-            return v, pin.aba(self.model, self.data, q, v, tau).copy()
-
-        k1 = slope(q, v)
-        k2 = slope(q + 0.5 * H * k1[0], v + 0.5 * H * k1[1])
-        k3 = slope(q + 0.5 * H * k2[0], v + 0.5 * H * k2[1])
-        k4 = slope(q + H * k3[0], v + H * k3[1])
-        q = q + H / 6.0 * (k1[0] + 2.0 * (k2[0] + k3[0]) + k4[0])
-        return q, v + H / 6.0 * (k1[1] + 2.0 * (k2[1] + k3[1]) + k4[1])
+        """The state after a step under a held torque."""
+        return runge_kutta(lambda t, q, v: pin.aba(self.model, self.data, q, v, tau), (q, v), H)
 
     def braking(self, v):
         """The hardest braking within the acceleration limits."""

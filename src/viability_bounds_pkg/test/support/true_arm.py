@@ -22,6 +22,20 @@ def model() -> pin.Model:
     return build_model(urdf, given["joints"], None, given.get("rotor_inertia"))
 
 
+def runge_kutta(acceleration, state, h):
+    """Return the state after a step of the classical method; `acceleration` is of (t, q, v)."""
+    q, v = state
+    k1 = np.array(acceleration(0.0, q, v))
+    v2 = v + 0.5 * h * k1
+    k2 = np.array(acceleration(0.5 * h, q + 0.5 * h * v, v2))
+    v3 = v + 0.5 * h * k2
+    k3 = np.array(acceleration(0.5 * h, q + 0.5 * h * v2, v3))
+    v4 = v + h * k3
+    k4 = np.array(acceleration(h, q + h * v3, v4))
+    q = q + h * (v + 2.0 * v2 + 2.0 * v3 + v4) / 6.0
+    return State(q, v + h * (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0)
+
+
 class TrueArm:
     """An arm under held commands, its motors with a first-order lag or without.
 
@@ -63,18 +77,11 @@ class TrueArm:
             tau = self.torque(command, t)
             return pin.aba(model(), self.data, q, v, tau) + self.disturbance(self.t + t)
 
-        (q, v), count = self.state, math.ceil(self.dt / 2.5e-4 - 1e-9)
+        count = math.ceil(self.dt / 2.5e-4 - 1e-9)
         h = self.dt / count
-        for t in (h * np.arange(count)).tolist():
-            k1 = acceleration(t, q, v)
-            v2 = v + 0.5 * h * k1
-            k2 = acceleration(t + 0.5 * h, q + 0.5 * h * v, v2)
-            v3 = v + 0.5 * h * k2
-            k3 = acceleration(t + 0.5 * h, q + 0.5 * h * v2, v3)
-            v4 = v + h * k3
-            k4 = acceleration(t + h, q + h * v3, v4)
-            q = q + h * (v + 2.0 * v2 + 2.0 * v3 + v4) / 6.0
-            v = v + h * (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0
-        self.state = State(q, v)
+        for start in (h * np.arange(count)).tolist():
+            self.state = runge_kutta(
+                lambda t, q, v, start=start: acceleration(start + t, q, v), self.state, h
+            )
         self.tau = self.torque(command, self.dt)
         self.t += self.dt
