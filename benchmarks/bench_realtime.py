@@ -72,7 +72,6 @@ LOAD_HEADS = (
     "late",
     "stopped",
     "nearest limit, rad",
-    "torque",
     "limits",
 )
 
@@ -196,7 +195,7 @@ def load_row(robot: str, kind: str, found: dict[str, Any]) -> tuple[str, ...]:
     keys = ("periods", "deadline_misses", "late_periods", "braked_periods")
     counts = (found[key] for key in keys)
     verdict = f"**passed**: {', '.join(passed)}" if passed else "kept"
-    return robot, kind, *counts, f"{nearest:.1g}", f"{worst('torque_ratio'):.3f}", verdict
+    return robot, kind, *counts, f"{nearest:.1g}", verdict
 
 
 def all_loads(options: argparse.Namespace) -> int:
