@@ -19,7 +19,7 @@ from viability_bounds_pkg.state import State
 HASTE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 LASTS = 0.6  # s of a fault
 EVERY = 3.5  # s from one to the next
-SECONDS = 12.5
+SECONDS = 9.0
 
 Lie = Callable[[State, State], State]
 """Returns what is said of a state; the second one is that in which the fault began."""
@@ -94,16 +94,8 @@ def play(robot: str, seed: int, lie: Lie, checked: bool = True) -> Played:
 
 
 @pytest.mark.parametrize("lie", LIES)
-@pytest.mark.parametrize(
-    "robot",
-    [
-        pytest.param("panda", marks=pytest.mark.long),
-        pytest.param("talos_left_arm", marks=pytest.mark.long),
-        "baxter_left_arm",
-    ],
-)
-def test_faults_in_motion_are_told_and_the_arm_goes_on(robot, lie):
-    played = play(robot, 3, LIES[lie])
+def test_faults_in_motion_are_told_and_the_arm_goes_on(lie):
+    played = play("baxter_left_arm", 3, LIES[lie])
     assert max(played.after) < 0.1
     assert len(played.again) == len(played.after) and max(played.again) < 1.0
     if lie != "a bias of velocities":  # 1.5 rad/s are obeyed for tens of ms
@@ -111,7 +103,6 @@ def test_faults_in_motion_are_told_and_the_arm_goes_on(robot, lie):
         assert played.position == 0.0 and played.speed <= (0.0 if lie == "zeros" else 0.02)
 
 
-@pytest.mark.long
 def test_untold_they_pass_limits():
-    played = play("panda", 0, LIES["states frozen"], checked=False)
+    played = play("baxter_left_arm", 3, LIES["states frozen"], checked=False)
     assert played.position > 0.1 or played.speed > 0.5

@@ -19,7 +19,6 @@ def play(robot, case, duration, seed=1):
 @pytest.mark.parametrize(
     ("robot", "case", "duration"),
     [
-        pytest.param("panda", "outage_stop", 4.0, marks=pytest.mark.long),
         pytest.param("talos_left_arm", "outage_stop", 3.0, marks=pytest.mark.long),
         ("baxter_left_arm", "all", 4.0),
     ],

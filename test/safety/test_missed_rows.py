@@ -50,8 +50,7 @@ def play(mode: str, seed: int) -> tuple[float, float, int]:
         return float(farthest[0]), float(farthest[1]), missing
 
 
-@pytest.mark.parametrize("mode", ["joints", "task"])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("mode", "seed"), [("joints", 0), ("task", 1)])
 def test_limits_are_kept(mode, seed):
     position, speed, missing = play(mode, seed)
     assert missing > 200

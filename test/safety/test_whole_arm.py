@@ -10,7 +10,6 @@ from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """A posture task that drives each joint to its limits, whatever the hand does."""
-FILTERED = {"safety_filter": True}
 SHOULDER = 1
 STRETCHED = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 """Where Baxter's shoulder needs more than it has."""
@@ -22,18 +21,19 @@ def load_at(loop, q):
     return np.abs(pin.computeGeneralizedGravity(loop.model, data, q)) / loop.config.torque_max
 
 
-def race(robot, seconds, seed, **changed):
-    """Go to random postures, half of the joints at their limits, each for 3 s."""
-    loop = DirectLoop(robot, STIFF | changed)
-    rng = np.random.default_rng(seed)
+def random_posture(loop, rng):
+    """Return one with half of the joints at their limits."""
     low, high = loop.limits.q_min, loop.limits.q_max
-    n = low.size
+    ends = np.where(rng.random(low.size) < 0.5, low, high)
+    return np.where(rng.random(low.size) < 0.5, ends, rng.uniform(low, high))
+
+
+def race(loop, seconds, seed):
+    """Go to random postures, each for 3 s."""
+    rng = np.random.default_rng(seed)
     for _ in range(round(seconds / 3.0)):
-        ends = np.where(rng.random(n) < 0.5, low, high)
-        goal = np.where(rng.random(n) < 0.5, ends, rng.uniform(low, high))
-        loop.controller.goals.set_posture(goal)
+        loop.controller.goals.set_posture(random_posture(loop, rng))
         loop.run(3.0)
-    return loop
 
 
 def beyond(loop):
@@ -55,10 +55,11 @@ def assert_kept(loop):
 
 @pytest.mark.long
 def test_baxters_shoulder_keeps_its_limits_only_with_the_filter():
-    without = beyond(race("baxter_left_arm", 30.0, 4, safety_filter=False))
-    assert without[0] > 0.1
-    assert without[1] > 0.1
-    loop = race("baxter_left_arm", 30.0, 4, safety_filter=True)
+    for filtered in (False, True):
+        loop = DirectLoop("baxter_left_arm", STIFF | {"safety_filter": filtered})
+        race(loop, 18.0, 4)
+        if not filtered:
+            assert min(beyond(loop)[:2]) > 0.1
     assert_kept(loop)
     outcomes = loop.controller.find(SafetyFilter).outcomes
     assert outcomes["outside"] == 0
@@ -66,21 +67,21 @@ def test_baxters_shoulder_keeps_its_limits_only_with_the_filter():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("robot", "seconds"), [("panda", 9.0), ("talos_left_arm", 6.0)])
+@pytest.mark.parametrize(("robot", "seconds"), [("panda", 6.0), ("talos_left_arm", 3.0)])
 def test_arms_with_weaker_motors_keep_their_limits(robot, seconds):
     """With limits of acceleration that were found for torque limits of 100%."""
-    tau_max = DirectLoop(robot).config.torque_max
-    loop = race(robot, seconds, 0, safety_filter=True, torque_max=(0.6 * tau_max).tolist())
+    tau_max = 0.6 * DirectLoop(robot).config.torque_max
+    loop = DirectLoop(robot, STIFF | {"safety_filter": True, "torque_max": tau_max.tolist()})
+    race(loop, seconds, 0)
     assert_kept(loop)
 
 
-@pytest.mark.parametrize("gains", [STIFF, {"pose_weight": 0.0, "posture_weight": 1.0}])
-def test_a_posture_that_cannot_be_held_is_approached_as_far_as_one_that_can(gains):
-    loop = DirectLoop("baxter_left_arm", gains | {"safety_filter": True})
+def test_a_posture_that_cannot_be_held_is_approached_as_far_as_one_that_can():
+    loop = DirectLoop("baxter_left_arm", STIFF | {"safety_filter": True})
     assert load_at(loop, STRETCHED)[SHOULDER] > 1.0
     start = loop.robot.state().q
     loop.controller.goals.set_posture(STRETCHED)
-    last = loop.run(10.0)[-100:]
+    last = loop.run(8.0)[-100:]
     q = column(last, "q")
     assert np.ptp(q, axis=0).max() < 0.02, "it does not stay"
     assert 0.9 < load_at(loop, q[-1])[SHOULDER] <= 0.98
@@ -93,7 +94,7 @@ def test_an_arm_that_starts_where_it_cannot_be_held_comes_down_slowly():
     loop = DirectLoop("baxter_left_arm", STIFF | {"safety_filter": True})
     loop.robot.reset(STRETCHED, np.zeros(7))
     loop.begin()
-    samples = loop.run(8.0)
+    samples = loop.run(6.0)
     assert loop.controller.find(SafetyFilter).slack >= -1e-3
     assert np.abs(column(samples, "v")[-1]).max() < 0.1
     assert load_at(loop, samples[-1].q)[SHOULDER] < 0.98
@@ -108,7 +109,7 @@ def test_before_what_cannot_be_held_the_arm_stops_short_of_its_goal():
     loop.robot.reset(above, np.zeros(7))
     loop.begin()
     loop.controller.goals.set_posture(below)
-    samples = loop.run(14.0)
+    samples = loop.run(10.0)
     assert np.abs(samples[-1].q - below).max() > 0.01
     assert np.abs(samples[-1].v).max() < 0.05
     assert beyond(loop)[:2] == (0.0, 0.0)

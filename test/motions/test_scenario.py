@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scenario with everything in it, played by the nodes and without them: the same numbers."""
-
-import json
-from pathlib import Path
+"""Scenarios, played by the nodes in lockstep: events at their times, and what is refused."""
 
 import numpy as np
 import pinocchio as pin
@@ -12,11 +9,12 @@ from chain import load_values, run_chain
 from direct import DirectLoop, column
 
 from sim_bridge.bullet.obstacles import Obstacle
-from sim_bridge.node.scenario_node import ScenarioNode, ScenarioRefused
-from sim_bridge.scenario.report import write_report
+from sim_bridge.node.scenario_messages import to_controller
+from sim_bridge.node.scenario_node import ScenarioRefused
+from sim_bridge.scenario.events import TrajectoryGoal, read_trajectory
+from sim_bridge.scenario.scenario import Scenario
+from torque_safety_controller.node.goal_messages import trajectory_from_message
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
-from viability_bounds_pkg.robot.description import read_urdf
-from viability_bounds_pkg.testing.executables import room_on_disk
 from viability_bounds_pkg.testing.ros_harness import config_folder
 
 ROBOT = "panda"
@@ -110,12 +108,22 @@ def test_a_hand_presses_on_a_table_as_hard_as_it_is_told():
     assert float(result.robot["contact_force_max_n"]) < 13.0
 
 
-def dds_threads():
-    """Return the numbers of the threads that send and receive for the nodes of this process."""
-    names = {each.parent.name: each.read_text() for each in Path("/proc/self/task").glob("*/comm")}
-    return {  # that of the watchdog of shared memory stays as long as the process
-        number for number, name in names.items() if name.startswith("dds.") and "wdog" not in name
-    }
+def test_the_controller_follows_the_points_that_the_scenario_means():
+    """In its own frames; a circle is in the test above."""
+    rng = np.random.default_rng(0)
+    base = pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3))
+    points = []
+    for k in range(4):
+        entry = {"time": 0.5 + k, "orientation": pin.Quaternion.Random().coeffs().tolist()}
+        entry |= {key: rng.normal(size=3).tolist() for key in ("position", "velocity")}
+        points.append(entry | {"acceleration": rng.normal(size=3).tolist()})
+    meant = read_trajectory({"points": points}, "")
+    plan = Scenario(9.0, (TrajectoryGoal(0.0, meant),))
+    (message,) = to_controller(plan, "base", "hand")
+    followed = trajectory_from_message(message.content, "base", "hand", base)
+    for t in np.linspace(0.0, meant.duration + 0.5, 41):
+        pose = base.actInv(followed.sample(t)[0])
+        assert np.abs(pin.log6(pose.actInv(meant.sample(t)[0])).vector).max() < 1e-7
 
 
 def rest():
@@ -133,9 +141,7 @@ def test_more_than_a_queue_holds_is_sent_in_portions():
             *({"time": 0.004 * k, "push": push} for k in range(6)),
         ],
     }
-    changed = {"scenario_node": {"ready_timeout": 5.0}}
-    # It begins when all of them have been reported as received.
-    result = run_chain(load_values(ROBOT), scenario, changed)
+    result = run_chain(load_values(ROBOT), scenario, {})
     assert result.run.lost == 0
     assert result.robot["world_changes_pending"] == "0"
 
@@ -160,88 +166,34 @@ def test_torque_control_is_handed_over_and_back():
 
 
 @pytest.mark.parametrize(
-    ("event", "names"),
+    ("event", "words"),
     [
         (
-            {"time": 0.1, "parameters": {"node": "controller_node", "values": {"pose_kp": -1.0}}},
-            ("at 0.1 s: controller_node/set_parameters", "pose_kp"),
-        ),
-        ({"time": 0.1, "call": {"service": "bullet_node/no"}}, ("no service bullet_node/no",)),
-        (
-            {"time": 0.1, "posture": {**rest(), "panda_joint4": 0.5}},
-            ("refused by controller_node: target_posture: 1",),
+            {"parameters": {"node": "controller_node", "values": {"pose_kp": -1.0}}},
+            "at 0.1 s: controller_node/set_parameters .*pose_kp",
         ),
         (
-            {"time": 0.1, "push": {"link": "no_link", "duration": 1.0, "force": [1.0, 0.0, 0.0]}},
-            ("refused by bullet_node: external_wrench: ",),
+            {"posture": rest() | {"panda_joint4": 0.5}},
+            "refused by controller_node: target_posture: 1",
         ),
     ],
 )
-def test_what_is_refused_ends_the_scenario_and_says_why(tmp_path, event, names):
-    # The scenario node believes in a link that the robot does not have.
-    urdf = read_urdf(load_values(ROBOT)["robot_description"])
-    other = tmp_path / "other.urdf"
-    other.write_text(urdf.replace("</robot>", '<link name="no_link"/></robot>'))
-    before = dds_threads()
-    with pytest.raises((ScenarioRefused, TimeoutError)) as error:
-        run_chain(
-            load_values(ROBOT),
-            {"duration": 0.3, "events": [event]},
-            {"scenario_node": {"ready_timeout": 1.0, "robot_description": str(other)}},
-        )
-    for name in names:
-        assert name in str(error.value)
-    # The error is still there, and keeps all that its frames hold; the nodes have gone.
-    assert dds_threads() <= before
+def test_what_is_refused_ends_the_scenario_and_says_why(event, words):
+    scenario = {"duration": 0.3, "events": [{"time": 0.1} | event]}
+    with pytest.raises(ScenarioRefused, match=words):
+        run_chain(load_values(ROBOT), scenario, {})
 
 
 def test_a_push_lasts_as_long_as_it_is_meant_to():
     """Longer than the robot holds a push that it hears no more of; and no longer."""
-    values = load_values(ROBOT)
-    begin, timeout, duration = 0.1, 0.2, 0.5  # s
-    push = {"link": "panda_link5", "duration": duration, "force": [0.0, 3.0, 0.0]}
+    begin, end = 0.1, 0.4  # s
+    push = {"link": "panda_link5", "duration": end - begin, "force": [0.0, 3.0, 0.0]}
     events = [{"time": begin, "push": push}, {"time": 0.0, "posture": rest()}]
-
-    def played(timeout):
-        per_node = {"bullet_node": {"external_wrench_timeout": timeout}}
-        return run_chain(values, {"duration": 1.2, "events": events}, per_node)
-
-    # A push and its end are sent ahead, with their stamps: the machine's speed does not matter.
-    result, patient = played(timeout), played(100.0)
-    for name in ("t", "q", "v", "tau"):
-        np.testing.assert_array_equal(getattr(result.run, name), getattr(patient.run, name))
+    short = {"bullet_node": {"external_wrench_timeout": 0.1}}
+    result = run_chain(load_values(ROBOT), {"duration": 0.6, "events": events}, short)
     t, dt = result.run.t, np.diff(result.run.t)[0]
     # The accelerations jump where the push begins and where it ends.
     jumps = np.abs(np.diff(result.run.v, 2, axis=0)).max(axis=1)
-    first, last = sorted(t[1:-1][np.argsort(jumps)[-2:]])
-    assert (first, last) == pytest.approx((begin, begin + duration), abs=0.5 * dt)
+    assert sorted(t[1:-1][np.argsort(jumps)[-2:]]) == pytest.approx([begin, end], abs=0.5 * dt)
     # The end of a push is nothing that the robot would refuse.
     assert "external_wrench" not in result.robot["commands_refused"]
-
-
-def test_a_run_without_a_pose_has_metrics_without_a_pose_error(tmp_path, ros, capfd):
-    scenario = {"duration": 0.1, "events": [{"time": 0.0, "posture": rest()}]}
-    path = tmp_path / "scenario.yaml"
-    path.write_text(yaml.safe_dump(scenario))
-    result = run_chain(load_values(ROBOT), scenario, {})
-    config = ros.start(ScenarioNode, load_values(ROBOT) | {"scenario": str(path)}).config
-    told = {"bullet_node": result.robot, "bounds_node": {"method": "exact"}, "controller_node": {}}
-    made = config, result.run, told
-    assert write_report(tmp_path / "out", *made)
-    full = tmp_path / "full"
-    with (
-        room_on_disk(40_000),
-        pytest.raises(OSError, match=f"no report in {full}: File too large"),
-    ):
-        write_report(full, *made)
-
-    def refuse(word):
-        raise AssertionError(f"{word} is not JSON")
-
-    text = (tmp_path / "out" / "metrics.json").read_text()
-    metrics = json.loads(text, parse_constant=refuse)
-    assert metrics["final_position_error_m"] is None
-    assert metrics["limits_kept"]
-    printed = capfd.readouterr().out
-    assert "nan" not in printed
-    assert printed.count("VERDICT: no limit was broken") == 2  # also without room for the files
