@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from arms import load_arm
-from geometry_msgs.msg import PoseStamped, TwistStamped
+from geometry_msgs.msg import TwistStamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -22,7 +22,6 @@ from viability_bounds_pkg.testing.ros_harness import read_config
 
 KINDS = {"bounds_node": BoundsNode, "controller_node": ControllerNode, "bullet_node": BulletNode}
 PATIENT = {"clock": "lockstep", "bounds_timeout": 5.0, "state_timeout": 10.0}
-DT = 0.002
 
 
 class Driven:
@@ -34,12 +33,11 @@ class Driven:
         self.joints = values["joints"]
         self.low, self.high = np.array(values["position_min"]), np.array(values["position_max"])
         # Not before the robot runs: publishers are found by then.
-        self.controller = ros.start(ControllerNode, values)
+        ros.start(ControllerNode, values)
         ros.start(BoundsNode, values)
         self.hand = ros.talk(TwistStamped, "jog_hand", GOAL_QOS)
         self.jog = ros.talk(JointState, "jog_joints", GOAL_QOS)
         self.trajectory = ros.talk(JointTrajectory, "target_joint_trajectory", GOAL_QOS)
-        self.pose = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
         self.states = ros.listen(JointState, "joint_states")
         ros.start(BulletNode, values)
         ros.wait_until(lambda: len(self.states) > 2)
@@ -47,6 +45,9 @@ class Driven:
     @property
     def q(self) -> np.ndarray:
         return np.array(self.states[-1].position[: len(self.joints)])
+
+    def refused(self) -> str:
+        return self.ros.reported("controller_node", "goals_refused")
 
     def positions(self, begin=0) -> np.ndarray:
         return np.array([state.position[: len(self.joints)] for state in self.states[begin:]])
@@ -66,6 +67,13 @@ class Driven:
 @pytest.fixture
 def arm(ros):
     return Driven(ros)
+
+
+def hand_at(q) -> np.ndarray:
+    """Return where the hand is, shape (3,), m."""
+    model = load_arm("panda").robot(0.0)
+    model.update(State(q, np.zeros(7)), np.zeros(7))
+    return model.pose.translation.copy()
 
 
 def points(*rows, step=0.5):
@@ -114,20 +122,18 @@ def test_a_jogged_joint_stops_when_no_jog_comes(arm):
     arm.ros.assert_limits_kept()
 
 
-@pytest.mark.parametrize("frame", ["panda_link0", "panda_hand"])
-def test_a_jogged_hand_moves_along_the_axis_asked_for(arm, frame):
-    poses = arm.ros.listen(PoseStamped, "hand_pose")
+@pytest.mark.parametrize(("frame", "up"), [("panda_link0", 1.0), ("panda_hand", -1.0)])
+def test_a_jogged_hand_moves_along_the_axis_asked_for(arm, frame, up):
     jog = TwistStamped()
     jog.header.frame_id = frame
     jog.twist.linear.z = 0.1  # of the hand: downwards in this posture
     arm.run(0.1)
+    before = hand_at(arm.q)
     arm.run(1.0, lambda: arm.hand.publish(jog))
     arm.run(1.0)
-    arm.ros.wait_until(lambda: len(poses) > 5)
-    p = np.array([[m.pose.position.x, m.pose.position.y, m.pose.position.z] for m in poses])
-    moved = p[-1] - p[0]
+    moved = hand_at(arm.q) - before
     assert np.abs(moved[:2]).max() < 0.01
-    assert 0.08 < moved[2] * (1 if frame == "panda_link0" else -1) < 0.16
+    assert 0.08 < up * moved[2] < 0.16
     arm.ros.assert_limits_kept()
 
 
@@ -157,52 +163,31 @@ def test_whatever_is_asked_for_limits_are_kept(arm):
         else:
             arm.jog.publish(JointState(name=arm.joints, velocity=[math.nan] * n))
 
-    arm.run(6.0, wild, every=0.1)
+    arm.run(4.0, wild, every=0.1)
     arm.ros.assert_limits_kept()
     assert np.ptp(arm.positions(), axis=0).max() > 0.5, "the arm was hardly driven"
-    assert arm.controller._goals.refused["jog_joints"] > 3
-    told = arm.ros.wait_until(lambda: arm.ros.diagnostics.get("controller_node"))
-    assert told["mode"] == "TRACKING"
+    assert "jog_joints" in arm.refused()
+    assert arm.ros.reported("controller_node", "mode") == "TRACKING"
 
 
 def test_keys_jog_the_arm(arm):
     before, node = arm.q, arm.ros.add(Node("teleop", context=arm.ros.context))
     arm.ros.probe.destroy_publisher(arm.jog)  # else there are two
     arm.ros.probe.destroy_publisher(arm.hand)
-    frames = "panda_link0", "panda_hand"
-    teleop = Teleop(node, arm.joints, frames, (0.1, 0.5, 0.3))
-    arm.ros.wait_until(lambda: teleop._joints.get_subscription_count())
-    arm.ros.wait_until(lambda: arm.ros.probe.count_publishers("jog_joints") == 1)
-    teleop.press("-", 0.0)
+    arm.ros.wait_until(lambda: arm.ros.probe.count_publishers("jog_joints") == 0)
+    teleop = Teleop(node, arm.joints, ("panda_link0", "panda_hand"), (0.1, 0.5, 0.3))
+    arm.ros.wait_until(
+        lambda: node.count_subscribers("jog_joints") and node.count_publishers("jog_joints") == 1
+    )
     clock = itertools.count()
+    teleop.press("-", 0.0)
     teleop.press("4", 0.0)  # held for 0.5 s
     arm.run(2.0, lambda: teleop.tick(0.05 * next(clock)))
     moved = arm.q - before
     assert -0.25 < moved[3] < -0.1
     assert np.abs(np.delete(moved, 3)).max() < 0.01
     assert teleop.press("t", 0.0) == "axes of panda_hand"
-    assert teleop._message is None
     arm.ros.assert_limits_kept()
-
-
-@pytest.mark.long
-def test_the_hand_goes_to_a_far_pose_no_faster_than_it_may_and_tells_that_it_is_out_of_reach(ros):
-    arm = Driven(ros, pose_speed_max=[0.2, 0.6])
-    goal = PoseStamped()
-    goal.pose.position.x, goal.pose.position.z = 1.3, 0.4  # 0.9 m ahead; 0.85 m can be reached
-    goal.pose.orientation.x, goal.pose.orientation.w = 1.0, 0.0
-    arm.pose.publish(goal)
-    arm.run(8.0)
-    model = load_arm("panda").robot(0.0)
-    speeds = []
-    for state in arm.states[::10]:
-        q, v = (np.array(part[:7]) for part in (state.position, state.velocity))
-        model.update(State(q, v), np.zeros(7))
-        speeds.append(np.linalg.norm((model.J @ v)[:3]))
-    assert 0.15 < max(speeds) < 0.22, max(speeds)
-    arm.ros.assert_limits_kept()
-    arm.ros.wait_until(lambda: "mm and" in ros.reported("controller_node", "short_of_goal"))
-    assert 300 < float(ros.reported("controller_node", "short_of_goal").split()[1]) < 700
 
 
 def refusals(arm):
@@ -212,15 +197,12 @@ def refusals(arm):
     turned.header.frame_id = "panda_link5"
     late = TwistStamped()
     set_stamp(late.header.stamp, 10**18)
-    half = points([start], [start, start])
     return [
         (arm.hand, turned),
         (arm.hand, late),
         (arm.jog, JointState(name=["panda_joint9"], velocity=[0.1])),
-        (arm.jog, JointState(name=arm.joints, position=start, velocity=start)),
         (arm.jog, JointState(name=arm.joints, velocity=[0.1])),
-        (arm.trajectory, JointTrajectory(joint_names=arm.joints[1:], points=half)),
-        (arm.trajectory, JointTrajectory(joint_names=arm.joints, points=half)),
+        (arm.trajectory, JointTrajectory(joint_names=arm.joints[1:], points=points([start]))),
         (arm.trajectory, JointTrajectory(joint_names=arm.joints, points=points([[9.0] * 7]))),
         (arm.trajectory, JointTrajectory(joint_names=arm.joints, points=points([[math.nan] * 7]))),
     ]
@@ -228,10 +210,8 @@ def refusals(arm):
 
 def test_what_cannot_be_followed_is_refused_and_counted(arm):
     before = arm.q
-    for count, (publisher, message) in enumerate(refusals(arm), 1):
+    for publisher, message in refusals(arm):
         publisher.publish(message)
-        refused = arm.controller._goals.refused
-        arm.ros.wait_until(lambda: refused.total() >= count)  # noqa: B023
-    assert refused == {"jog_hand": 2, "jog_joints": 3, "target_joint_trajectory": 4}
-    assert arm.controller._goals.motion is None
+    for count in ("jog_hand: 2", "jog_joints: 2", "target_joint_trajectory: 3"):
+        arm.ros.wait_until(lambda count=count: count in arm.refused(), count)
     assert np.abs(arm.q - before).max() < 1e-3

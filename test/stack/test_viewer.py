@@ -13,7 +13,6 @@ from sim_bridge.node.bullet_node import BulletNode
 from sim_bridge.node.viewer_node import PERIOD, ViewerNode
 from sim_bridge.viewer.page import DrivingAsked, GoalAsked, PushAsked
 from torque_safety_controller.node.controller_node import ControllerNode
-from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.testing.ros_harness import read_config
 
@@ -26,19 +25,18 @@ VALUES = read_config("panda", *KINDS) | PATIENT | {"viewer_port": 18080}
 class Viewed:
     """A Panda in lockstep, and a viewer that shows it whenever the nodes have run."""
 
-    def __init__(self, ros, **changed):
-        values = VALUES | changed
+    def __init__(self, ros):
         self.ros = ros
         self.goals = ros.listen(PoseStamped, "target_pose")
         self.pushes = ros.listen(WrenchStamped, "external_wrench")
-        self.controller = ros.start(ControllerNode, values)
-        self.bounds = ros.start(BoundsNode, values)
-        self.viewer = ros.start(ViewerNode, values)
+        ros.start(ControllerNode, VALUES)
+        ros.start(BoundsNode, VALUES)
+        self.viewer = ros.start(ViewerNode, VALUES)
         self.page = self.viewer.page
-        ros.start(BulletNode, values)
-        self.wait(lambda: self.viewer._reader.stamp > 0)
+        ros.start(BulletNode, VALUES)
+        self.wait(lambda: ros.reported("bullet_node", "control") == "torque")
 
-    def wait(self, condition, timeout=90.0):
+    def wait(self, condition, timeout=300.0):
         """Let nodes and page run until a condition holds."""
         end = time.monotonic() + timeout
         while not condition():
@@ -59,6 +57,10 @@ class Viewed:
             self.page._requests.put(request)
         self.viewer.update_page()
 
+    def drivers(self):
+        """How many nodes publish goals."""
+        return self.ros.probe.count_publishers("target_pose")
+
     def hand(self):
         return self.page._data.oMf[self.page._hand].copy()
 
@@ -71,9 +73,9 @@ def arm(ros):
 def test_nothing_is_sent_before_the_user_drives(arm):
     goal = pin.SE3(np.eye(3), np.array([0.4, 0.1, 0.5]))
     arm.ask(GoalAsked(goal), PushAsked("panda_link4", np.ones(3)))
-    assert arm.controller.count_publishers("target_pose") == 0
+    assert arm.drivers() == 0
     arm.ask(DrivingAsked(True))
-    arm.wait(lambda: arm.controller.count_publishers("target_pose") == 1)
+    arm.wait(lambda: arm.drivers() == 1)
     arm.ask(GoalAsked(goal), PushAsked("panda_link4", np.array([0.0, 20.0, 0.0])))
     arm.wait(lambda: arm.goals and arm.pushes)
     position = arm.goals[-1].pose.position
@@ -82,21 +84,7 @@ def test_nothing_is_sent_before_the_user_drives(arm):
     assert arm.pushes[-1].wrench.force.y == 20.0
     arm.ask(DrivingAsked(False))
     arm.wait(lambda: arm.pushes[-1].wrench.force.y == 0.0)
-    arm.wait(lambda: arm.controller.count_publishers("target_pose") == 0)
-
-
-@pytest.mark.parametrize(
-    "name, value, words",
-    [
-        ("end_effector_frame", "hand", "a frame of the URDF"),
-        ("viewer_host", "192.0.2.1", "an address of this machine"),
-        ("acceleration_max", [1.0], "7 numbers"),
-    ],
-)
-def test_what_cannot_be_shown_is_refused_at_start(ros, name, value, words):
-    with pytest.raises(SettingError, match=words) as refused:
-        ros.start(ViewerNode, VALUES | {name: value})
-    assert refused.value.name == name
+    arm.wait(lambda: arm.drivers() == 0)
 
 
 @pytest.mark.long
@@ -109,7 +97,7 @@ def test_a_drag_in_a_browser_moves_the_arm(arm, tmp_path):
         assert browser.value("document.querySelectorAll('svg.joints circle').length") == 7
         browser.value("[...document.querySelectorAll('input[type=checkbox]')].pop().click()")
         arm.wait(lambda: arm.page._driving and arm.page._goal.visible)
-        arm.wait(lambda: arm.controller.count_publishers("target_pose") == 1)
+        arm.wait(lambda: arm.drivers() == 1)
         start = arm.hand()
         # The arrow of the goal's handle that points down is pulled up, when the page shows it.
         for pause in 0.7, 1.0, 1.5, 2.0, 3.0, 5.0:  # a browser on a busy machine is slow
