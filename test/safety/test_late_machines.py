@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_a_stack_that_is_paused_keeps_the_limits():
     words = ["realtime", "--loads", "--seconds", "3", "--case", "baxter_left_arm@100"]
     words += ["--load", "pause controller_node"]
-    run = run_to_end("bash", ROOT / "scripts" / "bench.sh", *words)
+    run = run_to_end("bash", ROOT / "scripts" / "bench.sh", *words, timeout=600.0)
     assert run.returncode == 0, run.stdout + run.stderr
     cells = run.stdout.splitlines()[-1].split(" | ")
     assert cells[:2] == ["baxter_left_arm", "pause controller_node"]

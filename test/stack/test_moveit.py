@@ -122,13 +122,13 @@ class User:
         return Goal(self, self.goal(**parts))
 
     def wait(self, goal):
-        self.ros.wait_until(lambda: goal.answer)
+        self.ros.wait_until(lambda: goal.answer, timeout=300.0)
         return goal.outcome
 
     def run(self, duration):
         """Let robot time pass."""
         end = stamp_to_ns(self.states[-1].header.stamp) + round(1e9 * duration)
-        self.ros.wait_until(lambda: stamp_to_ns(self.states[-1].header.stamp) > end)
+        self.ros.wait_until(lambda: stamp_to_ns(self.states[-1].header.stamp) > end, timeout=300.0)
 
 
 def test_goals_are_reached_one_after_the_other(ros, moveit):
