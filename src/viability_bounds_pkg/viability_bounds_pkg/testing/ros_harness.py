@@ -54,7 +54,7 @@ def config_folder() -> Path:
     return Path(get_package_share_directory("sim_bridge")) / "config"
 
 
-TIMEOUT = 30.0
+TIMEOUT = 120.0
 """How long anything may take before a test fails, s; far more than it takes."""
 
 RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
