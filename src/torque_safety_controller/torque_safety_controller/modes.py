@@ -104,7 +104,7 @@ CAUSES = {
         "no plan within all limits is known",
     ),
     "rival": Cause(
-        "a goal comes while several nodes publish such",
+        "a goal comes while several nodes publish goals",
         "one of them is left",
         Mode.HOLD,
         Goals.SLOWED,
