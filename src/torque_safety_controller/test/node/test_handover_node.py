@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from controller_chain import NODE, ControllerChain
+from controller_chain import MS, NODE, ControllerChain
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -223,12 +223,10 @@ def test_nothing_is_sent_once_it_is_stopped(ros):
     chain.answer()
     # States that cannot be used: the drives hold on.
     bad = np.full(N, math.nan)
-    chain.commands.clear()
     assert_position(chain.await_command(50, lambda: chain.state(50, bad)))
     chain.await_report(each=lambda: chain.state(50, bad), mode="STOPPED", reason="refused")
-    chain.commands.clear()
-    ros.run_for(0.1, each=lambda: chain.state(50, bad))
-    assert not chain.commands
+    ros.run_for(0.1, each=lambda: chain.state(60, bad))
+    assert max(chain.commands.stamps) == 50 * MS
 
 
 def test_a_robot_that_is_put_elsewhere_is_held_there_however_near(ros):

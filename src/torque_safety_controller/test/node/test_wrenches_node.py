@@ -9,11 +9,11 @@ import pytest
 import yaml
 from arms import load_arm
 from controller_chain import NODE, ControllerChain, controller_of
+from controllers import pose_at
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from std_srvs.srv import Trigger
 
-from torque_safety_controller.node.goal_messages import numbers_of
 from torque_safety_controller.parts.contact.interaction import Interaction
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot.description import inertia_beyond, read_urdf
@@ -44,11 +44,16 @@ def weight() -> np.ndarray:
 
 
 WEIGHT = weight()
-STILL = (0.0, 0.0, 0.0)
+NOTHING = "", (0.0, 0.0, 0.0)
 
 
 class WrenchChain(ControllerChain):
-    """The other side of the controller, with a force/torque sensor."""
+    """The other side of the controller, with a force/torque sensor.
+
+    Attributes:
+        feels: frame and force that the sensor measures beside the hand's weight, N; None while it
+            is silent.
+    """
 
     def __init__(self, ros, **changed) -> None:
         super().__init__(ros, VALUES | changed)
@@ -56,15 +61,14 @@ class WrenchChain(ControllerChain):
         self.targets = ros.talk(WrenchStamped, "target_wrench", GOAL_QOS)
         self.poses = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
         self.stamp = 0
-        self.feels: WrenchStamped | None = None
+        self.feels: tuple[str, tuple[float, ...]] | None = None
 
     def step(self) -> np.ndarray:
         """Let 2 ms of robot time pass; return the torques."""
         self.stamp += 2
         if self.feels is not None:
-            values = numbers_of(self.feels.wrench.force, self.feels.wrench.torque) + WEIGHT
-            frame = self.feels.header.frame_id
-            self.measured.publish(wrench_message(frame, values[:3], values[3:]))
+            frame, force = self.feels
+            self.measured.publish(wrench_message(frame, force + WEIGHT[:3], WEIGHT[3:]))
         tau = np.array(self.ask(self.stamp, ARM.q_start, np.zeros(ARM.n)).effort)
         assert np.isfinite(tau).all()
         assert (np.abs(tau) <= ARM.tau_max).all()
@@ -74,18 +78,16 @@ class WrenchChain(ControllerChain):
         self.ros.wait_until(lambda: value in self.reported(key), f"{key} {value}", each=self.step)
 
     def give_pose(self) -> None:
-        pose = ARM.robot(0.0)
-        pose.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
-        self.poses.publish(pose_message(pose.pose))
+        self.poses.publish(pose_message(pose_at(ARM, ARM.q_start)))
         self.until("mode", "TRACKING")
 
 
 def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
     hand = WrenchChain(ros)
-    hand.feels = wrench_message("panda_link8", (1.0, 0.0, 0.0))
+    hand.feels = "panda_link8", (1.0, 0.0, 0.0)
     hand.give_pose()
     hand.until("compliance", "holding")
-    hand.feels = wrench_message("panda_link8", (0.0, 30.0, 0.0))
+    hand.feels = "panda_link8", (0.0, 30.0, 0.0)
     hand.until("compliance", "yielding")
     assert "threshold" in hand.reported("compliance_reason")
     hand.feels = None
@@ -93,7 +95,7 @@ def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
     assert hand.reported("mode") == "TRACKING"
     assert hand.reported("level") == DiagnosticStatus.WARN
     assert "sensor is silent" in hand.reported("message")
-    hand.feels = wrench_message("", (0.0, 30.0, 0.0))
+    hand.feels = "", (0.0, 30.0, 0.0)
     hand.until("compliance", "yielding")
     # An empty threshold switches it off.
     ros.accepts(NODE, yield_threshold=[])
@@ -102,12 +104,12 @@ def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
 
 def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
     hand = WrenchChain(ros)
-    hand.feels = wrench_message("panda_link8", (0.0, 30.0, math.nan))
+    hand.feels = "panda_link8", (0.0, 30.0, math.nan)
     hand.give_pose()
     hand.until("wrenches_refused", "not six finite numbers")
-    hand.feels = wrench_message("moon", (0.0, 30.0, 0.0))
+    hand.feels = "moon", (0.0, 30.0, 0.0)
     hand.until("wrenches_refused", "another frame_id")
-    hand.feels = wrench_message("", (0.0, 1e300, 0.0))
+    hand.feels = "", (0.0, 1e300, 0.0)
     hand.until("wrenches_refused", "beyond 100000 N or N m")
     assert hand.reported("compliance") == "sensor silent"
 
@@ -115,21 +117,21 @@ def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
 def test_targets_that_cannot_be_exerted_are_refused_and_others_are_exerted(ros):
     """In contact with what gives exactly that back, the motors carry it."""
     hand = WrenchChain(ros, yield_threshold=[])
-    hand.feels = wrench_message("", STILL)
+    hand.feels = NOTHING
     hand.give_pose()
     before = hand.step()
     for k, message in enumerate(
         (
             wrench_message("", (0.0, 0.0, math.inf)),
             wrench_message("", (0.0, 0.0, 1e300)),
-            wrench_message("moon", STILL),
+            wrench_message("moon", NOTHING[1]),
         )
     ):
         hand.targets.publish(message)
         hand.until("goals_refused", f"target_wrench: {k + 1};")
     assert hand.reported("compliance") != "force"
     hand.targets.publish(wrench_message("panda_hand", (0.0, 0.0, 10.0)))
-    hand.feels = wrench_message("", (0.0, 0.0, -10.0))
+    hand.feels = "", (0.0, 0.0, -10.0)
     hand.until("compliance", "force")
     robot = ARM.robot(0.0)
     robot.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
@@ -145,11 +147,11 @@ def test_after_the_strongest_wrenches_that_are_taken_the_arm_goes_on(ros):
     """Sums, squares and filters of larger ones would not be finite for ever."""
     hand = WrenchChain(ros)
     most = 0.999e5  # N; without the weight of the hand
-    hand.feels = wrench_message("panda_link8", (most, -most, most))
+    hand.feels = "panda_link8", (most, -most, most)
     hand.give_pose()
     hand.targets.publish(wrench_message("panda_hand", (1e5, 1e5, -1e5)))
     hand.until("compliance", "force")
-    hand.feels = wrench_message("", STILL)
+    hand.feels = NOTHING
     hand.targets.publish(wrench_message("panda_hand", (0.0, 0.0, 1.0)))
     hand.until("target_wrench", "1")
     for _ in range(200):  # 0.4 s
@@ -159,14 +161,14 @@ def test_after_the_strongest_wrenches_that_are_taken_the_arm_goes_on(ros):
 
 def test_a_tare_takes_what_is_felt_for_the_bias_but_not_from_a_hand_that_is_led(ros):
     hand = WrenchChain(ros)
-    hand.feels = wrench_message("", (4.0, 0.0, 0.0))
+    hand.feels = "", (4.0, 0.0, 0.0)
     hand.give_pose()
     for _ in range(3):
         hand.step()
     answer = ros.call(Trigger, f"{NODE}/tare_ft_sensor", Trigger.Request())
     assert answer.success
     hand.until("ft_bias", "4 ")
-    hand.feels = wrench_message("", (40.0, 0.0, 0.0))
+    hand.feels = "", (40.0, 0.0, 0.0)
     hand.until("compliance", "yielding")
     answer = ros.call(Trigger, f"{NODE}/tare_ft_sensor", Trigger.Request())
     assert not answer.success

@@ -34,16 +34,11 @@ VALUES = {
 }
 LIMITS = JointLimits(
     tuple(JOINTS),
-    *(
-        VALUES[name]
-        for name in (
-            "position_min",
-            "position_max",
-            "velocity_max",
-            "acceleration_min",
-            "acceleration_max",
-        )
-    ),
+    VALUES["position_min"],
+    VALUES["position_max"],
+    VALUES["velocity_max"],
+    VALUES["acceleration_min"],
+    VALUES["acceleration_max"],
 )
 REST = [0.0, 0.0, 0.0]
 # Each joint on its way to its upper limit, braking hard enough for the bounds to be narrow.

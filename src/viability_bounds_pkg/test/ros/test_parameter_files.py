@@ -6,7 +6,6 @@ import math
 import pytest
 from rclpy.parameter import Parameter
 
-from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.parameter_files import (
     ParameterFileError,
@@ -15,7 +14,6 @@ from viability_bounds_pkg.parameter_files import (
     load_yaml,
     node_parameters,
     read_sections,
-    unknown_parameters,
 )
 from viability_bounds_pkg.ros.given_parameters import given_parameters, remember_arguments
 
@@ -99,12 +97,3 @@ def test_yaml_is_read_as_rcl_reads_it():
     assert load_yaml(text) == values | {"h": "package://a/b"}
     with pytest.raises(YamlError, match=r"^f, line 1: 'a' a second time"):
         load_yaml("{a: 1, a: 1}", "f")
-
-
-def test_names_that_are_near_are_proposed():
-    assert unknown_parameters(["rate_hz", "own"], ["own"]) == ""
-    assert unknown_parameters(["distrubance_time", "zzz"]) == (
-        "unknown parameter 'distrubance_time'; did you mean 'disturbance_time'?; "
-        "unknown parameter 'zzz'"
-    )
-    assert did_you_mean("/Panda_Hand/", ["panda_hand", "other"]) == "; did you mean 'panda_hand'?"

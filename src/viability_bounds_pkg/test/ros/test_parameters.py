@@ -194,23 +194,3 @@ def test_changes_that_fit_only_together_are_made_at_once(ros):
     result = node.set_parameters_atomically(overrides({"shape": "flat", "gain": -1.0}))
     assert not result.successful
     assert node.config.changing == (8.0, 6.0, "round")
-
-
-def test_descriptions_tell_what_may_change_and_to_what(ros):
-    node = start(ros)
-    gain = node.describe_parameter("gain")
-    (allowed,) = gain.floating_point_range
-    assert (gain.description, gain.read_only) == ("1/s", False)
-    assert (allowed.from_value, allowed.to_value) == (0.0, 1e3)
-    assert node.describe_parameter("damping").floating_point_range[0].from_value == -1.0
-    assert node.describe_parameter("count").integer_range[0].to_value == 5
-    assert node.describe_parameter("rate").read_only
-    for name, expected in (
-        ("gain", "a number > 0 and <= 1000"),
-        ("limits", "finite numbers > 0, one for each of 'joints'"),
-        ("extra", "numbers, one for each of 'joints', or none"),
-        ("pair", "2 numbers"),
-        ("shape", "one of round, flat"),
-        ("enabled", ""),
-    ):
-        assert node.describe_parameter(name).additional_constraints == expected
