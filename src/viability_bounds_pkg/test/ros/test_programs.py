@@ -121,14 +121,16 @@ def test_a_program_that_was_killed_and_started_again_is_heard_and_obeyed(ros):
             text=True,
             preexec_fn=as_child,
         ) as program:
-            assert program.stdout.readline() == "there\n"
-            ros.wait_until(
-                lambda pid=program.pid: pid in obeyed,
-                "an answer that is obeyed",
-                each=lambda: ask.publish(String()),
-                timeout=15.0,  # by default the killed one counts as a publisher for 20 s
-            )
-            program.kill()
+            try:
+                assert program.stdout.readline() == "there\n"
+                ros.wait_until(
+                    lambda pid=program.pid: pid in obeyed,
+                    "an answer that is obeyed",
+                    each=lambda: ask.publish(String()),
+                    timeout=15.0,  # by default the killed one counts as a publisher for 20 s
+                )
+            finally:
+                program.kill()
 
 
 def test_settings_of_fast_dds_that_users_have_are_kept(tmp_path, monkeypatch):
