@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Friction told from motions of an arm whose masses are not those of the model."""
+"""Friction told from recordings of an arm whose masses are not those of the model; the tool."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
 import pytest
+import yaml
 from arms import load_arm
 
 from torque_safety_controller.friction.identification import friction_model, identify
@@ -16,11 +18,15 @@ from torque_safety_controller.friction.joint_recording import (
     make_blocks,
 )
 from torque_safety_controller.friction.settings import FrictionModel
+from torque_safety_controller.tools.identify_friction import main
+from viability_bounds_pkg.testing.executables import called
+from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
 ARM = load_arm("panda")
 N = ARM.n
 PERIOD = 2e-3  # s
 COULOMB = 0.1 * ARM.tau_max
+COEFFICIENTS = ("coulomb", "static", "viscous", "stribeck_velocity")
 TRUTH = FrictionModel(COULOMB, 1.3 * COULOMB, 0.2 * COULOMB, np.full(N, 0.03))
 
 
@@ -91,7 +97,7 @@ def fitted(recording):
 
 
 def rows(model) -> np.ndarray:
-    return np.array([model.coulomb, model.static, model.viscous, model.stribeck_velocity])
+    return np.array([getattr(model, name) for name in COEFFICIENTS])
 
 
 def off(fits, truth=TRUTH) -> np.ndarray:
@@ -208,3 +214,65 @@ def test_gaps_are_left_out():
     blocks = make_blocks(Recording(**contents), 0.02)
     assert len(blocks.t) == 49
     np.testing.assert_allclose(blocks.a[:, 0], 0.6, atol=1e-9)
+
+
+# The tool
+
+
+@pytest.fixture
+def call(capfd):
+    """Runs the tool for Panda in this process."""
+    return partial(called, capfd, main, config_folder() / "panda.yaml")
+
+
+def save(path, recording, count=None):
+    """Write a recording, its joints in another order."""
+    columns = {key: getattr(recording, key)[:count, ::-1] for key in ("q", "v", "tau")}
+    joints = np.array(read_config("panda", "controller_node")["joints"][::-1])
+    np.savez(path, joints=joints, t=recording.t[:count], **columns)
+    return path
+
+
+def parameters_in(text):
+    content = yaml.safe_load(text)
+    assert list(content) == ["/**/controller_node"]
+    return content["/**/controller_node"]["ros__parameters"]
+
+
+def test_the_tool_writes_an_overlay_or_prints_it(recording, call, tmp_path):
+    run, output = save(tmp_path / "run.npz", recording), tmp_path / "friction.yaml"
+    ended = call(run, "-o", output)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    written = parameters_in(output.read_text())
+    # Not the switch: identifying must not change how the robot is controlled.
+    assert set(written) == {f"friction_model_{name}" for name in COEFFICIENTS}
+    for name in COEFFICIENTS:
+        found = written[f"friction_model_{name}"]
+        np.testing.assert_allclose(found, getattr(TRUTH, name), rtol=0.05)
+    for shown in ("panda_joint1: ", "coulomb", "+-", "residual", f"written to {output}"):
+        assert shown in ended.stdout
+    printed = call(run).stdout
+    assert parameters_in(printed[printed.index("# Friction found") :]) == written
+
+
+def test_what_is_not_told_is_said_in_the_file(call, tmp_path):
+    run = save(tmp_path / "run.npz", record(*KINDS, still=[6]))
+    output = tmp_path / "friction.yaml"
+    assert call(run, "-o", output).returncode == 0
+    text = output.read_text()
+    assert "# panda_joint7: nothing found: it did not move both ways" in text
+    assert parameters_in(text)["friction_model_coulomb"][6] == 0.0
+
+
+def test_what_cannot_be_done_is_told_in_one_line_and_leaves_files_alone(recording, call, tmp_path):
+    run, output = save(tmp_path / "run.npz", recording, 1000), tmp_path / "friction.yaml"
+    before = run.read_bytes()
+    ended = call(run, "-o", run)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("identify_friction: ") and ended.stderr.count("\n") == 1
+    assert "is read, and cannot be written too" in ended.stderr
+    assert run.read_bytes() == before
+    ended = call(run, "-o", output)
+    assert ended.returncode == 1
+    assert ended.stderr.strip().endswith("tells nothing about friction: see above")
+    assert not output.exists()

@@ -169,16 +169,6 @@ def reach(start, control) -> Chain:
     return chain
 
 
-@pytest.mark.parametrize("control", Control)
-def test_control_changes_by_its_table_and_not_else(control):
-    for event in {event for _, event in CHANGES}:
-        supervisor = reach("torque", control).supervisor
-        supervisor.change(event, "there")
-        assert supervisor.control is CHANGES.get((control, event), control)
-        drives = supervisor.control in (Control.POSITION, Control.TAKING_OVER)
-        assert supervisor.by_drives == drives
-
-
 @pytest.mark.parametrize(
     ("start", "control", "after"),
     [
