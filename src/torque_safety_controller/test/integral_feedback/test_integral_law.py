@@ -111,8 +111,9 @@ def test_whole_torque_solves_the_extended_problem():
     rng = np.random.default_rng(3)
     active = 0
     for _ in range(100):
-        M, C = random_dynamics(rng, speed=3.0)
-        s, budget = rng.normal(size=N), rng.uniform(0.1, 5.0, N)
+        unit = 10.0 ** rng.uniform(-2.0, 1.0)
+        M, C = (unit * each for each in random_dynamics(rng, speed=3.0))
+        s, budget = rng.normal(size=N), unit * rng.uniform(0.1, 5.0, N)
         torque, leak = uncorrected(IntegralSettings(budget), s, M, C)
         Ks = 2.0 * np.diag(M) * s
         u, w = C @ s + Ks, C @ s + np.clip(Ks, -budget, budget)
@@ -123,7 +124,7 @@ def test_whole_torque_solves_the_extended_problem():
         # The leak makes up for just what the torque lacks.
         missing = max(s @ w - s @ torque, 0.0)
         assert leak == pytest.approx(missing / (s @ M @ s), rel=1e-6, abs=1e-9)
-        active += np.abs(torque - np.clip(u, -budget, budget)).max() > 1e-3
+        active += np.abs(torque - np.clip(u, -budget, budget)).max() > 1e-3 * unit
     assert active > 20
 
 

@@ -17,7 +17,6 @@ _TALOS = "package://example-robot-data/robots/talos_data/robots/talos_reduced.ur
 _TALOS_JOINTS = ["torso_1_joint", "torso_2_joint"] + [f"arm_left_{i}_joint" for i in range(1, 8)]
 _POSTURES = {
     "panda": [0.3, 0.4, 0.2, -1.6, 0.1, 2.0, 0.5],
-    "baxter_left_arm": [0.2, -0.4, 0.3, 1.4, 0.2, 0.9, 0.3],
     "talos": [0.0, 0.1, 0.4, 0.5, -0.3, -1.5, 0.2, 0.1, 0.1],
 }
 
@@ -42,7 +41,7 @@ class TaskArm:
     """An arm, its hand and, for tasks of more than 6 rows, the position of its elbow.
 
     Args:
-        robot: ``panda``, ``baxter_left_arm`` or ``talos``: torso and arm, 9 joints.
+        robot: ``panda``, or ``talos`` for its torso and left arm, 9 joints.
         rows: of the task.
         armature: reflected inertia of each rotor, kg m^2.
     """
@@ -79,26 +78,6 @@ class TaskArm:
         J = pin.computeJointJacobians(self.model, data, q)
         J = pin.getJointJacobian(self.model, data, self.elbow, pin.LOCAL_WORLD_ALIGNED)
         return J[:3].T @ force
-
-    def reference(
-        self,
-        q: np.ndarray,
-        v: np.ndarray,
-        terms: Terms,
-        hand: pin.SE3,
-        kp=400.0,
-        kd=40.0,
-        damping=5.0,
-        stiffness=0.0,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return accelerations that hold the hand at a place and the arm near its posture.
-
-        And the error of the hand, shape (m,), m and rad.
-        """
-        error = pin.log6(self.hand(q).actInv(hand)).vector[: self.rows]
-        rest = stiffness * (self.posture - q) - damping * v
-        task = kp * error - kd * terms.J @ v - terms.J_dot @ v
-        return rest + np.linalg.pinv(terms.J) @ (task - terms.J @ rest), error
 
     def move(
         self, q: np.ndarray, v: np.ndarray, tau: np.ndarray, dt: float, friction: float = 0.0
