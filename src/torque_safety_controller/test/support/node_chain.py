@@ -36,9 +36,9 @@ GOAL_Q = Q + 0.1
 SAME_TORQUE = 1e-6  # N m; two runs of the solver
 
 
-def expected(pose=None, posture=None, gains=GAINS) -> Controller:
+def expected(pose=None, posture=None) -> Controller:
     """The node's core, set up by hand."""
-    controller = make(ARM, gains=gains)
+    controller = make(ARM, gains=GAINS)
     controller.reset(Q)
     if pose is not None:
         controller.goals.set_pose(pose)
