@@ -4,26 +4,20 @@
 import numpy as np
 import pytest
 from arms import load_arm
-from controller_chain import NODE, ControllerChain
+from controller_chain import NODE, ControllerChain, patient_values
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.testing.ros_harness import read_config
 
 ARM = load_arm("panda")
-VALUES = read_config("panda", NODE) | {
-    "bounds_timeout": 20.0,
-    "state_timeout": 40.0,
-    "collision_avoidance": True,
-    "obstacles": [
-        "{name: ball, shape: sphere, size: [0.2, 0.2, 0.2], position: [0.42, 0.0, 0.6]}"
-    ],
-}
+BALL = "{name: ball, shape: sphere, size: [0.2, 0.2, 0.2], position: [0.42, 0.0, 0.6]}"
 AWAY = ARM.q_start + np.array([1.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def test_an_overlap_is_reported_and_countered_until_it_is_over(ros, capfd):
-    chain = ControllerChain(ros, VALUES)
+    chain = ControllerChain(
+        ros, patient_values("panda", collision_avoidance=True, obstacles=[BALL])
+    )
     at_rest = np.zeros(ARM.n)
     tau = np.array(chain.ask(10, ARM.q_start, at_rest, -2.0, 2.0).effort)
     assert (np.abs(tau) <= ARM.tau_max).all()

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from controller_chain import MS, NODE, ControllerChain
+from controller_chain import MS, NODE, ControllerChain, patient_values
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -18,12 +18,7 @@ from viability_bounds_pkg.testing.ros_harness import read_config
 
 SERVICE = f"{NODE}/enable_torque"
 
-# Watchdogs that do not bark while a busy machine runs the other tests.
-VALUES = read_config("panda", NODE) | {
-    "start_control": "position",
-    "bounds_timeout": 20.0,
-    "state_timeout": 40.0,
-}
+VALUES = patient_values("panda", start_control="position")
 JOINTS = VALUES["joints"]
 N = len(JOINTS)
 TAU_MAX = np.array(VALUES["torque_max"])

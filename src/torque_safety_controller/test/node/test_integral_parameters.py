@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from arms import load_arm
-from controller_chain import NODE, ControllerChain, controller_of, gains_of
+from controller_chain import NODE, ControllerChain, controller_of, gains_of, patient_values
 from controllers import make
 
 from torque_safety_controller.controller import Controller
@@ -15,16 +15,11 @@ from torque_safety_controller.parts.integral import Integral, make_integral
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.testing.ros_harness import names_parameter, read_config
+from viability_bounds_pkg.testing.ros_harness import names_parameter
 
 ARM = load_arm("panda")
 PERIOD = round(1e3 * ARM.dt)  # ms
-VALUES = read_config("panda", NODE) | {
-    "bounds_timeout": 20.0,
-    "state_timeout": 40.0,
-    "disturbance_time": 0.0,
-    "integral_action": "joints",
-}
+VALUES = patient_values("panda", disturbance_time=0.0, integral_action="joints")
 N = ARM.n
 Q = ARM.q_start
 WIDE = np.full(N, 50.0)

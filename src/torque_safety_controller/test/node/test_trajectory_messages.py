@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from arms import load_arm
-from controller_chain import MS, NODE, ControllerChain, gains_of
+from controller_chain import MS, ControllerChain, gains_of, patient_values
 from controllers import make, pose_at
 from geometry_msgs.msg import Transform, Twist
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
@@ -17,7 +17,6 @@ from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.testing.ros_harness import read_config
 
 PLANE = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]  # from the lowest point towards y
 BASE = pin.SE3(pin.utils.rotate("z", 0.7), np.array([0.1, 0.2, 0.3]))
@@ -98,11 +97,7 @@ def test_velocities_may_be_left_out():
 
 def test_it_is_followed_in_the_robots_time(ros):
     arm = load_arm("panda")
-    values = read_config("panda", NODE) | {
-        "state_timeout": 40.0,
-        "bounds_timeout": 20.0,
-        "disturbance_time": 0.0,
-    }
+    values = patient_values("panda", disturbance_time=0.0)
     chain = ControllerChain(ros, values)
     q, v = arm.q_start, np.zeros(arm.n)
     wide = AccelerationRange(np.full(arm.n, -50.0), np.full(arm.n, 50.0))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from controller_chain import NODE, ControllerChain, controller_of
+from controller_chain import NODE, ControllerChain, controller_of, patient_values
 from geometry_msgs.msg import PoseStamped
 from node_chain import pose_message
 
@@ -15,12 +15,7 @@ from viability_bounds_pkg.robot.description import build_model, read_urdf
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.testing.ros_harness import read_config
 
-VALUES = read_config("two_hands/talos_arms", NODE) | {
-    "bounds_timeout": 20.0,
-    "state_timeout": 40.0,
-    "integral_action": "none",
-    "disturbance_time": 0.0,
-}
+VALUES = patient_values("two_hands/talos_arms", integral_action="none", disturbance_time=0.0)
 Q = np.array(read_config("two_hands/talos_arms", "bullet_node")["start_positions"])
 FRAMES = VALUES["end_effector_frame"].split()
 

@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 import yaml
 from arms import load_arm
-from controller_chain import NODE, ControllerChain, controller_of
+from controller_chain import NODE, ControllerChain, controller_of, patient_values
 from controllers import pose_at
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -20,16 +20,14 @@ from viability_bounds_pkg.robot.description import inertia_beyond, read_urdf
 from viability_bounds_pkg.ros.messages import pose_message, wrench_message
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.testing.ros_harness import read_config
 
 ARM = load_arm("panda")
-FORCES = {
+VALUES = patient_values("panda") | {
     "ft_frame": "panda_link8",
     "force_directions": [0.0, 0.0, 1.0, 0.0, 0.0, 0.0],
     "yield_threshold": [10.0, 2.0],
     "contacts": ["{frame: panda_hand, point: [0, 0, 0.1], normal: [0, 0, -1], friction: 0.5}"],
 }
-VALUES = read_config("panda", NODE) | FORCES | {"state_timeout": 40.0, "bounds_timeout": 20.0}
 
 
 def weight() -> np.ndarray:

@@ -17,10 +17,20 @@ from torque_safety_controller.parameters.controller_parameters import Controller
 from torque_safety_controller.tasks.gains import Gains, critical_damping
 from viability_bounds_pkg.parameter import parameter_table, read
 from viability_bounds_pkg.ros.topics import state_topic
-from viability_bounds_pkg.testing.ros_harness import RosHarness, acceleration_limits, joint_state
+from viability_bounds_pkg.testing.ros_harness import (
+    RosHarness,
+    acceleration_limits,
+    joint_state,
+    read_config,
+)
 
 MS = 1_000_000
 NODE = "controller_node"
+
+
+def patient_values(robot: str, **changed: Any) -> dict[str, Any]:
+    """Return a robot's parameters, with watchdogs that do not bark while other tests run."""
+    return read_config(robot, NODE) | {"bounds_timeout": 20.0, "state_timeout": 40.0} | changed
 
 
 def gains_of(values: Mapping[str, Any]) -> Gains:

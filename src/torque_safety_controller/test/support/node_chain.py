@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 from arms import load_arm
-from controller_chain import NODE, ControllerChain, gains_of
+from controller_chain import ControllerChain, gains_of, patient_values
 from controllers import make
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
@@ -15,17 +15,10 @@ from torque_safety_controller.controller import Controller
 from viability_bounds_pkg.ros import messages
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.testing.ros_harness import read_config
 
 ARM = load_arm("baxter_left_arm")
-# Watchdogs that do not bark while a busy machine runs the other tests.
 # The arm of these tests does not move as it is told, which is not to count as a disturbance.
-VALUES = read_config("baxter_left_arm", NODE) | {
-    "bounds_timeout": 20.0,
-    "state_timeout": 40.0,
-    "disturbance_time": 0.0,
-    "safety_filter": False,  # which has tests of its own
-}
+VALUES = patient_values("baxter_left_arm", disturbance_time=0.0, safety_filter=False)
 JOINTS = VALUES["joints"]
 GAINS = gains_of(VALUES)
 Q = ARM.q_start
