@@ -187,21 +187,25 @@ def with_memory(seed, **changes):
 
 
 @pytest.mark.parametrize("fast", [0.6, 100.0])
-@pytest.mark.parametrize("seed", range(4))
-def test_limiting_takes_energy_away_and_never_adds_any(seed, fast):
-    """The memory after limiting gives just the limited torque, and stores no more."""
-    run, wide, tight = with_memory(seed, fast_leak_rate=fast)
-    free = wide.torque(run.now, run.a_ref, DT)
-    budgets = np.abs(free) * np.random.default_rng(seed).uniform(0.3, 2.0, 9)
-    tight.settings = replace(tight.settings, budget=budgets)
-    got = tight.torque(run.now, run.a_ref, DT)
-    assert tight.saturated.any() and not wide.saturated.any()
-    assert (np.abs(got) <= budgets).all()
-    M = run.terms.M
-    assert energy(tight, M) <= energy(wide, M) * (1.0 + 1e-12)
-    # Without more error it goes on from there.
-    after = tight.torque(run.now, run.a_ref, 0.0)
-    np.testing.assert_allclose(after, got, atol=1e-9)
+def test_limiting_cuts_the_torque_as_far_as_that_stores_no_more_energy(fast):
+    in_part = 0
+    for seed in range(40):
+        run, wide, tight = with_memory(seed, fast_leak_rate=fast)
+        free = wide.torque(run.now, run.a_ref, DT)
+        budgets = np.abs(free) * np.random.default_rng(seed).uniform(0.3, 2.0, 9)
+        tight.settings = replace(tight.settings, budget=budgets)
+        got = tight.torque(run.now, run.a_ref, DT)
+        assert tight.saturated.any() and not wide.saturated.any()
+        assert (np.abs(got) <= budgets).all()
+        gained = energy(tight, run.terms.M) / energy(wide, run.terms.M) - 1.0
+        assert gained <= 1e-12
+        if np.abs(got - np.clip(free, -budgets, budgets)).max() > 1e-9:
+            in_part += 1
+            assert gained >= -1e-9  # as far as may be
+        # Without more error it goes on from there.
+        after = tight.torque(run.now, run.a_ref, 0.0)
+        np.testing.assert_allclose(after, got, atol=1e-9)
+    assert in_part > 1
 
 
 @pytest.mark.parametrize("seed", range(3))
