@@ -200,7 +200,7 @@ def test_the_hand_is_shown_in_the_base_frame_until_the_robot_is_silent(ros):
     shown = pose_from_message(hand[-1], frame)
     assert shown.isApprox(base.actInv(pose_at(Q)), 1e-9)
     chain.await_mode("STOPPED")
-    ros.run_for(0.02)
+    ros.run_for(0.2)
     hand.clear()
     ros.run_for(0.2)
     assert not hand

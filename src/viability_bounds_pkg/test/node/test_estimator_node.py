@@ -10,6 +10,7 @@ from sensor_msgs.msg import JointState
 from true_arm import model
 
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 from viability_bounds_pkg.state_estimation.observer import design_observer
@@ -40,31 +41,31 @@ class EstimatorProbe:
 
     def ask(self, message) -> JointState:
         """Send a state until it is answered, return the answer."""
+        stamp = stamp_to_ns(message.header.stamp)
         self.answers.clear()
         self.ros.wait_until(
-            lambda: self.answers,
+            lambda: stamp in self.answers.stamps,
             "an answer",
             each=lambda: self.states.publish(message),
             period=0.1,
         )
-        return self.answers[-1]
+        return self.answers[self.answers.stamps.index(stamp)]
 
     def state(self, k, q=HOME, v=STILL, tau=()):
         """Ask with joints in the usual order, return the estimate."""
         answer = self.ask(joint_state(JOINTS, k * PERIOD, q, v, tau))
-        assert self.answers.stamps[-1] == k * PERIOD
         assert answer.name == JOINTS
         return State(np.array(answer.position), np.array(answer.velocity))
 
-    def command(self, k, tau=(), q=(), joints=JOINTS) -> None:
+    def command(self, k, tau=(), joints=JOINTS) -> None:
         """Send a command that the node reads."""
         before = self.node.commands_heard
-        message = joint_state(joints, k * PERIOD, q, (), tau)
+        message = joint_state(joints, k * PERIOD, (), (), tau)
         self.ros.wait_until(
             lambda: self.node.commands_heard > before,
             "the command",
             each=lambda: self.commands.publish(message),
-            period=0.1,
+            period=1.0,  # so long that none comes late, and is taken for the next one
         )
 
     def reported(self, key):
