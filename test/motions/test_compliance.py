@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TALOS with friction, compliant in its null space or at its hand, and a Panda that presses.
+"""TALOS with friction, compliant in its null space or at its hand.
 
 Shorter runs of what `scripts/reproduce.sh paper1-compliance` plays. The simulated sensor has bias
 and noise, and a tool heavier than the URDF says.
@@ -10,7 +10,7 @@ import compliance_push as pushing
 import numpy as np
 import pinocchio as pin
 import pytest
-from compliance_hand import ELBOW, ELBOW_PUSH, FORCE, HAND, PULL, ROBOT, judge_press, lead, press
+from compliance_hand import ELBOW, ELBOW_PUSH, HAND, PULL, ROBOT, lead
 from direct import DirectLoop, within_limits
 
 pytestmark = pytest.mark.long
@@ -31,13 +31,11 @@ def test_a_pushed_elbow_gives_way_and_the_hand_stays_as_stiff():
 
 
 def test_unknown_poles_are_given_way_to_and_the_curve_is_drawn():
-    runs = {name: curve.draw(own, curve.POLES, 1, 6.0) for name, own in pushing.MODES.items()}
-    found = {name: curve.judge(run) for name, run in runs.items()}
-    assert all(run.touched for run in runs.values())
-    assert found[COMPLIANT]["hand_m"] < 0.02
-    assert found[COMPLIANT]["within_limits"]
-    assert found[COMPLIANT]["force_n"] < found[LACKING]["force_n"]
-    assert found[COMPLIANT]["impulse_n_s"] < found[LACKING]["impulse_n_s"]
+    run = curve.draw(pushing.MODES[COMPLIANT], curve.POLES, turns=1, period=6.0)
+    assert run.touched
+    found = curve.judge(run)
+    assert found["hand_m"] < 0.02
+    assert found["within_limits"]
 
 
 def test_a_pulled_hand_stays_where_it_is_let_go_and_does_not_yield_for_the_elbow():
@@ -59,16 +57,6 @@ def test_a_hand_whose_sensor_falls_silent_is_led_no_more():
     # Still pulled at, it is stiff.
     assert np.linalg.norm(led.place[silent:] - led.place[silent], axis=1).max() < 0.005
     assert within_limits(led.loop)
-
-
-def test_a_table_is_pressed_on_without_a_bounce_while_the_hand_slides():
-    numbers = judge_press(press(duration=4.2, slide=(2.2, 3.5)))
-    assert numbers["error_standing"] < 0.05
-    assert numbers["error_sliding"] < 0.05
-    assert numbers["most_n"] < FORCE + 2.0
-    assert numbers["least_after_contact_n"] > FORCE - 2.0
-    assert numbers["periods_without_contact"] == 0.0
-    assert numbers["limits_kept"]
 
 
 def test_an_arm_with_a_stretched_elbow_gets_away_from_a_goal_beyond_reach():

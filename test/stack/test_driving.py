@@ -21,15 +21,15 @@ from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 KINDS = {"bounds_node": BoundsNode, "controller_node": ControllerNode, "bullet_node": BulletNode}
-PATIENT = {"clock": "lockstep", "bounds_timeout": 5.0, "state_timeout": 10.0}
+PATIENT = {"clock": "lockstep", "bounds_timeout": 5.0, "state_timeout": 10.0, "rate_hz": 200.0}
 
 
 class Driven:
     """A Panda in lockstep, and a user who sends something at instants of the robot's time."""
 
-    def __init__(self, ros, **changed) -> None:
+    def __init__(self, ros) -> None:
         self.ros = ros
-        values = read_config("panda", *KINDS) | PATIENT | changed
+        values = read_config("panda", *KINDS) | PATIENT
         self.joints = values["joints"]
         self.low, self.high = np.array(values["position_min"]), np.array(values["position_max"])
         # Not before the robot runs: publishers are found by then.
@@ -98,7 +98,7 @@ def test_a_trajectory_is_followed_and_then_held(arm):
     message = JointTrajectory(joint_names=names, points=points([(goal)[::-1]], step=2.0))
     set_stamp(message.header.stamp, begin)
     arm.trajectory.publish(message)
-    arm.run(3.5)
+    arm.run(2.6)
     arm.ros.assert_limits_kept()
     t = (np.array(arm.states.stamps) - begin) * 1e-9 / 2.0
     x = np.clip(t, 0.0, 1.0)[:, None]
@@ -166,7 +166,7 @@ def test_whatever_is_asked_for_limits_are_kept(arm):
     arm.run(4.0, wild, every=0.1)
     arm.ros.assert_limits_kept()
     assert np.ptp(arm.positions(), axis=0).max() > 0.5, "the arm was hardly driven"
-    assert "jog_joints" in arm.refused()
+    arm.ros.wait_until(lambda: "jog_joints" in arm.refused(), "a report")
     assert arm.ros.reported("controller_node", "mode") == "TRACKING"
 
 

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).resolve().parents[2]
 KINDS = {"bounds_node": BoundsNode, "controller_node": ControllerNode, "bullet_node": BulletNode}
-PATIENT = {"clock": "lockstep", "bounds_timeout": 5.0, "state_timeout": 10.0}
+PATIENT = {"clock": "lockstep", "bounds_timeout": 5.0, "state_timeout": 10.0, "rate_hz": 200.0}
 VALUES = read_config("panda", *KINDS) | PATIENT
 JOINTS = VALUES["joints"]
 GOAL = np.array(VALUES["start_positions"]) + [0.2, 0.1, -0.2, 0.2, 0.2, 0.2, 0.3]
@@ -165,7 +165,7 @@ def test_one_that_is_cancelled_stops(ros, moveit):
 
 def test_a_newer_goal_takes_the_place_of_an_older_one_unless_it_is_refused(ros, moveit):
     user = User(ros, moveit)
-    first = user.send(duration=8.0)
+    first = user.send(duration=100.0)
     ros.wait_until(lambda: first.feedback)
     far = GOAL.copy()
     far[3] = 1.0
