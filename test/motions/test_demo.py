@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import subprocess
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -54,10 +55,10 @@ def test_an_imperfect_robot_is_played_by_programs_of_their_own(tmp_path):
 
 @pytest.mark.long
 def test_a_signal_takes_down_all_of_it(tmp_path):
-    endless = tmp_path / "endless.yaml"
-    endless.write_text("{duration: 1000.0, events: []}")
+    long = tmp_path / "long.yaml"
+    long.write_text("{duration: 20.0, events: []}")
     demo = subprocess.Popen(
-        ["bash", DEMO, "panda", endless, "--out", tmp_path],
+        ["bash", DEMO, "panda", long, "--out", tmp_path],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -65,7 +66,7 @@ def test_a_signal_takes_down_all_of_it(tmp_path):
         preexec_fn=as_child,
     )
     try:
-        assert any("nearest limit" in line for line in demo.stdout), demo.stderr.read()
+        assert any("nearest limit" in line for line in demo.stdout)  # a quarter is over
         demo.send_signal(signal.SIGINT)
         _, errors = demo.communicate(timeout=DEADLINE)
         assert demo.returncode == 130, errors
@@ -73,4 +74,5 @@ def test_a_signal_takes_down_all_of_it(tmp_path):
         with pytest.raises(ProcessLookupError):  # nothing that it has started is left
             os.killpg(demo.pid, 0)
     finally:
-        demo.kill()
+        with suppress(ProcessLookupError):
+            os.killpg(demo.pid, signal.SIGKILL)

@@ -114,7 +114,8 @@ def test_the_controller_follows_the_points_that_the_scenario_means():
     base = pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3))
     points = []
     for k in range(4):
-        entry = {"time": 0.5 + k, "orientation": pin.Quaternion.Random().coeffs().tolist()}
+        turn = pin.Quaternion(pin.exp3(rng.normal(size=3))).coeffs()
+        entry = {"time": 0.5 + k, "orientation": turn.tolist()}
         entry |= {key: rng.normal(size=3).tolist() for key in ("position", "velocity")}
         points.append(entry | {"acceleration": rng.normal(size=3).tolist()})
     meant = read_trajectory({"points": points}, "")
