@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller node reads and publishes: limits, goals, torques, and what tools show."""
+"""The messages of the controller node: states, limits, goals, torques, and what tools are shown."""
 
 import math
 
 import numpy as np
+import pytest
 from controller_chain import MS
 from geometry_msgs.msg import PoseStamped
 from node_chain import (
@@ -26,10 +27,49 @@ from rclpy.qos import qos_profile_system_default
 from std_msgs.msg import Float64MultiArray, String
 
 from torque_safety_controller.node.goal_messages import pose_from_message
+from torque_safety_controller.node.periodic import StateStream
 from torque_safety_controller.qp import AccelerationRange
+from viability_bounds_pkg.ros.messages import Arrival
 from viability_bounds_pkg.ros.runtime import LATCHED_QOS, STATUS_QOS
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import acceleration_limits, joint_state
+
+# Joint states
+
+STATE = [0.1, 0.2]
+MOVED = [0.1, 0.3]
+
+
+def arrives(stream, stamp, now, q=STATE):
+    """Let a state with a stamp, ms, arrive at a time, s."""
+    return stream.read(joint_state(("a", "b"), stamp * MS, q, [0.0, 0.0]), now)
+
+
+@pytest.mark.parametrize(
+    ("stamp", "q", "now", "arrival"),
+    [
+        (102, STATE, 10.01, Arrival.NEW),
+        (100, STATE, 10.01, Arrival.REPEATED),
+        (100, STATE, 10.6, Arrival.RESUMED),
+        (100, MOVED, 10.6, Arrival.RESTARTED),  # another robot at the same time
+        (100, MOVED, 10.01, Arrival.REFUSED),
+        (102, STATE, 10.6, Arrival.NEW),  # its time stood still, as of a halted simulation
+        (700, STATE, 10.6, Arrival.RESTARTED),
+        (50, STATE, 10.01, Arrival.REFUSED),
+        (50, STATE, 10.6, Arrival.RESTARTED),
+        (1200, STATE, 10.01, Arrival.NEW),  # the time alone has leapt
+        (1200, MOVED, 10.01, Arrival.RESTARTED),
+        (102, [math.nan, 0.2], 10.01, Arrival.REFUSED),
+    ],
+)
+def test_what_a_state_is_after_one_that_was_answered(stamp, q, now, arrival):
+    stream = StateStream(("a", "b"), timeout=0.5)
+    assert arrives(stream, 100, 10.0) is Arrival.RESTARTED
+    stream.mark_answered()
+    assert arrives(stream, stamp, now, q) is arrival
+    accepted = arrival in (Arrival.NEW, Arrival.RESTARTED)
+    np.testing.assert_array_equal(stream.q, q if accepted else STATE)
+
 
 # Limits
 
