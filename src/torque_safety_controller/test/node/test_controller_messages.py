@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of the controller node: states, limits, goals, torques, and what tools are shown."""
+"""Messages of the controller node: states, limits, goals, torques, and what tools are shown."""
 
 import math
 
