@@ -67,39 +67,32 @@ def test_between_points_at_rest_it_turns_about_one_axis():
         np.testing.assert_allclose(pose.translation - first.translation, share * way, atol=1e-9)
 
 
-# Two axes at right angles, neither along x, y or z.
-E_1, E_2 = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, 1.0])
-START = pin.SE3(pin.exp3(np.array([0.3, -1.0, 0.5])), np.array([0.4, 0.3, 0.2]))
-
-
 def test_a_circle_goes_round_from_rest_to_rest():
-    points = circle(START, 0.2, (E_1, E_2), period=2.0, turns=2.0)
-    centre = START.translation - 0.2 * E_1
-    outward = np.array([point.pose.translation for point in points]) - centre
-    np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 0.2, rtol=1e-12)
-    np.testing.assert_allclose(outward @ np.cross(E_1, E_2), 0.0, atol=1e-15)
-    np.testing.assert_allclose(outward[0], 0.2 * E_1, atol=1e-15)
-    angles = np.unwrap(np.arctan2(outward @ E_2, outward @ E_1))
-    assert angles[-1] == pytest.approx(4.0 * np.pi)
-    assert (np.diff(angles) > 0.0).all()
-    for end in (points[0], points[-1]):
-        np.testing.assert_allclose((end.velocity, end.acceleration), 0.0, atol=1e-12)
-        np.testing.assert_array_equal(end.pose.rotation, points[1].pose.rotation)
-    assert points[-1].time == pytest.approx(4.0)
-
-
-def test_velocities_and_accelerations_of_a_circle_are_derivatives():
-    points = circle(START, 0.2, (E_1, E_2), period=2.0, points_per_turn=5000)
+    """Its velocities and accelerations are derivatives."""
+    # Two axes at right angles, neither along x, y or z.
+    e_1, e_2 = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, 1.0])
+    start = pin.SE3(pin.exp3(np.array([0.3, -1.0, 0.5])), np.array([0.4, 0.3, 0.2]))
+    points = circle(start, 0.2, (e_1, e_2), period=2.0, turns=2.0, points_per_turn=3000)
     t = np.array([point.time for point in points])
     p = np.array([point.pose.translation for point in points])
     v = np.array([point.velocity[:3] for point in points])
     a = np.array([point.acceleration[:3] for point in points])
+    outward = p - (start.translation - 0.2 * e_1)
+    np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 0.2, rtol=1e-12)
+    np.testing.assert_allclose(outward @ np.cross(e_1, e_2), 0.0, atol=1e-15)
+    np.testing.assert_allclose(outward[0], 0.2 * e_1, atol=1e-15)
+    angles = np.unwrap(np.arctan2(outward @ e_2, outward @ e_1))
+    assert (t[-1], angles[-1]) == pytest.approx((4.0, 4.0 * np.pi))
+    assert (np.diff(angles) > 0.0).all()
+    np.testing.assert_allclose((v[0], a[0], v[-1], a[-1]), 0.0, atol=1e-12)
     np.testing.assert_allclose(np.gradient(p, t, axis=0)[1:-1], v[1:-1], atol=4e-6)
     np.testing.assert_allclose(np.gradient(v, t, axis=0)[1:-1], a[1:-1], atol=4e-5)
     # The few points of a message make the same curve.
-    coarse = PoseTrajectory(circle(START, 0.2, (E_1, E_2), period=2.0))
+    coarse = PoseTrajectory(circle(start, 0.2, (e_1, e_2), period=2.0, turns=2.0))
     for k in range(0, len(t), 37):
-        np.testing.assert_allclose(coarse.sample(t[k])[0].translation, p[k], atol=1e-7)
+        pose = coarse.sample(t[k])[0]
+        np.testing.assert_allclose(pose.translation, p[k], atol=1e-7)
+        np.testing.assert_allclose(pose.rotation, start.rotation, atol=1e-12)
 
 
 HALF_TURN = pin.SE3(pin.utils.rotate("x", np.pi), np.zeros(3))

@@ -17,7 +17,6 @@ from estimated_models import (
 )
 
 from viability_bounds_pkg.acceleration_limits import (
-    EmptyIntervalError,
     estimate_acceleration_limits,
     limits_in_share,
 )
@@ -129,18 +128,6 @@ def test_same_seed_same_limits(search):
     assert np.any(first.q != other.q)
 
 
-def test_caps_and_overrides():
-    model = baxter()
-    arguments = {"samples": 1000, "overrides": {"left_s1": (-3.0, 2.0)}}
-    plain = estimate_acceleration_limits(model, *limits_of(model), **arguments)
-    assert (plain.a_min[1], plain.a_max[1]) == (-3.0, 2.0)
-    assert plain.overridden == {"left_s1"}
-    capped = estimate_acceleration_limits(model, *limits_of(model), **arguments, cap=15.0)
-    assert (capped.a_min[6], capped.a_max[6]) == (-15.0, 15.0)
-    assert capped.a_max[0] == plain.a_max[0] < 15.0
-    assert (capped.a_min[1], capped.a_max[1]) == (-3.0, 2.0)
-
-
 def test_limits_of_a_share_are_available_in_as_many_other_states():
     """By Algorithm 4's lines for single states, which are others than those used."""
     model, share = baxter(), 0.8
@@ -156,21 +143,10 @@ def test_limits_of_a_share_are_available_in_as_many_other_states():
     np.testing.assert_allclose(available / count, share, atol=0.03)
 
 
-def test_gravity_beyond_the_torque_is_named():
-    """What too much speed gives, see `test_estimate_executable`."""
-    with pytest.raises(EmptyIntervalError) as raised:
-        estimate_acceleration_limits(pendulum(), [-3], [3], [4.0], [5.0], 500)
-    assert (raised.value.joint, raised.value.scale) == ("joint1", 0.0)
-    assert "lower velocities do not help" in str(raised.value)
-    assert "takes 9.81 N m just to hold still" in str(raised.value)
-    assert "\n" not in str(raised.value)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"q_min": [0.0]}, "q_min must have 7 values"),
-        ({"q_min": np.full(7, 9.0)}, "joint left_s0: position limits"),
         ({"q_max": np.full(7, np.inf)}, "joint left_s0: position limits"),
         ({"v_max": np.zeros(7)}, "joint left_s0: v_max must be positive"),
         ({"tau_max": np.full(7, np.nan)}, "joint left_s0: tau_max must be positive"),

@@ -38,12 +38,6 @@ def test_rotors_are_on_the_diagonal_of_the_inertia_matrix(urdf):
     np.testing.assert_allclose(pin.aba(with_rotors, data, q, v, tau), a, atol=1e-10)
 
 
-@pytest.mark.parametrize("rotors", [ROTORS[:6], [*ROTORS[:6], -0.1], [*ROTORS[:6], np.nan]])
-def test_rotors_that_cannot_be_are_refused(urdf, rotors):
-    with pytest.raises(RobotDescriptionError, match="rotor_inertia must be 7 finite numbers"):
-        build_model(urdf, JOINTS, None, rotors)
-
-
 @pytest.mark.parametrize(
     ("element", "value"),
     [("mass value", "heavy"), ("mass value", "1 kg"), ("inertia ixx", "nan"), ("axis xyz", "$x")],

@@ -240,18 +240,6 @@ def test_joints_may_be_in_any_order(panda):
         np.testing.assert_allclose(found, one.torque(moved, 0.9 * v)[order], atol=1e-5)
 
 
-def test_a_stop_begun_anew_remembers_nothing(panda):
-    rng = np.random.default_rng(7)
-    q, v = panda.edge(rng)
-    fresh, used = panda.stop(observer_time=0.002), panda.stop(observer_time=0.002)
-    used.start(*panda.edge(rng))
-    for _ in range(5):
-        used.torque(*panda.edge(rng))
-    for stop in (fresh, used):
-        stop.start(q, v)
-    np.testing.assert_array_equal(fresh.torque(q, v), used.torque(q, v))
-
-
 @pytest.mark.parametrize(
     ("changed", "says"),
     [

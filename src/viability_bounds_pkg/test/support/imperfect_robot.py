@@ -139,7 +139,7 @@ class ImperfectRobot:
             self.seen.see(low, high, self.v)
             return
         q, v, a = self.q, self.v, self.a
-        for t in np.linspace(0.0, time, 9)[1:]:
+        for t in np.linspace(0.0, time, 5)[1:]:
             gone = 1.0 - np.exp(-t / lag)
             rest = lag * (a - command)
             self.v = v + t * (command + disturbance) + rest * gone
