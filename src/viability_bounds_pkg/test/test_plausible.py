@@ -59,6 +59,7 @@ SPOILT = {
     "far too fast": (lambda state: state._replace(v=1e200 * state.v), TOO_FAST, 0.0),
     "a position leaps": (lambda state: state._replace(q=state.q + 0.4 * JOINT), JUMP, 0.0),
     "a biased velocity": (lambda state: state._replace(v=state.v + JOINT), CONTRADICTION, WINDOW),
+    "at rest elsewhere": (lambda state: State(0.0 * state.q - 1.0, 0.0 * state.v), JUMP, 0.0),
     "frozen": (lambda state: sine(1.0), CONTRADICTION, 0.06),
     "frozen positions": (lambda state: state._replace(q=sine(1.0).q), CONTRADICTION, 0.06),
     "a frozen position": (frozen_joint, CONTRADICTION, 0.15),
@@ -76,7 +77,7 @@ def test_what_cannot_be_is_refused_and_what_comes_afterwards_is_accepted(name, h
     assert refused[-1][0] <= 1.6 + longest + h
 
 
-@pytest.mark.parametrize("name", ["frozen", "degrees"])
+@pytest.mark.parametrize("name", ["frozen", "degrees", "at rest elsewhere"])
 def test_what_stays_impossible_stays_refused(name):
     spoil, _, within = SPOILT[name]
     refused = play(make_check(h=0.01), spoil, 0.01, end=6.0, last=6.0)

@@ -92,7 +92,7 @@ def test_gravity_beyond_the_torque(write_robot, call, tmp_path):
     assert "joint shoulder" in line and "5 N m" in line
     assert "lower velocities do not help" in line
     holds = float(re.search(r"joint shoulder takes (.*) N m just to hold still", line)[1])
-    assert holds == pytest.approx(WEIGHT, rel=0.01)
+    assert 5.0 < holds <= 1.001 * WEIGHT
     assert not output.exists()
     ended = call(path, "--samples", 300, "--override", "shoulder=-1,1")
     assert printed(ended)["acceleration_max"][0] == 1.0

@@ -34,12 +34,14 @@ def gravity(state):
 MOVING = State(STILL.q, np.array([0.3, -0.4, 0.5, 0.3, -0.6, 0.5, 0.7]))
 
 
-def errors(ours, dt, delay, lag=0.0, start=MOVING, steps=30, missed=(), coarse=0.0, w=0.0):
+def errors(
+    ours, dt, delay, lag=0.0, start=MOVING, steps=30, missed=(), lost=(), coarse=0.0, w=0.0
+):
     """Return the largest errors of the predicted states of an arm that takes random torques.
 
-    `missed` are states whose commands never come, `coarse` is the resolution of the encoders, rad:
-    velocities are not told then, and efforts have noise. `w` is the size of an acceleration that
-    the model does not know, rad/s^2.
+    `missed` are states whose commands never come, and `lost` those that never come themselves.
+    `coarse` is the resolution of the encoders, rad: velocities are not told then, and efforts have
+    noise. `w` is the size of an acceleration that the model does not know, rad/s^2.
     """
     rng = np.random.default_rng(3)
     # Torques around those that hold the arm, that change as quickly whatever the period is.
@@ -58,9 +60,9 @@ def errors(ours, dt, delay, lag=0.0, start=MOVING, steps=30, missed=(), coarse=0
             if k > 10:  # at first the effort alone tells the torque
                 effort = effort + 0.01 * MAX * np.clip(rng.standard_normal(N), -3, 3)
         stamp = round(1e9 * k * dt)
-        predicted.append(ours.step(stamp, told, effort))
+        predicted.append(None if k in lost else ours.step(stamp, told, effort))
         command = np.array([np.interp(k * dt, np.linspace(0.0, 0.2, 11), row) for row in table.T])
-        if k in missed:
+        if k in missed or k in lost:
             command = sent[-1]  # the robot keeps the last one
         else:
             ours.answer(stamp, command)
@@ -69,7 +71,7 @@ def errors(ours, dt, delay, lag=0.0, start=MOVING, steps=30, missed=(), coarse=0
         sent = [*sent[1:], command]
         arm.step(sent[0])
     pairs = list(zip(predicted, met[delay:], strict=False))[delay + 2 :]
-    return np.max([np.abs(np.subtract(x, y)) for x, y in pairs], axis=0)
+    return np.max([np.abs(np.subtract(x, y)) for x, y in pairs if x is not None], axis=0)
 
 
 @pytest.mark.parametrize(("delay", "lag"), [(0, 0.0), (2, 0.0), (2, 0.0016), (5, 0.0016)])
@@ -80,8 +82,9 @@ def test_prediction_is_that_of_an_independent_integration(delay, lag):
     assert v.max() <= 5e-4 * (1 + delay)
 
 
-def test_prediction_knows_that_a_missed_command_leaves_the_last():
-    q, v = errors(estimator(2), DT, 2, missed={10, 11, 12, 20})
+@pytest.mark.parametrize("without", ["missed", "lost"])
+def test_prediction_knows_that_without_a_command_the_last_one_acts(without):
+    q, v = errors(estimator(2, longest_gap=4), DT, 2, **{without: {10, 11, 12, 20}})
     assert q.max() <= 3e-6
     assert v.max() <= 15e-4
 
@@ -162,6 +165,13 @@ def test_the_torque_believed_is_the_command_unless_the_effort_disproves_it(
 
     assert speed(command, effort) == pytest.approx(speed(believed, believed), abs=1e-9)
     assert speed(1.0, 1.0) > 0.01
+
+
+def test_where_no_command_is_sent_the_effort_tells_what_the_robot_does():
+    ours, tau, k = standing(delay=2)
+    for more in range(10):
+        answer = ours.step((k + more) * PERIOD_NS, STILL, tau + 0.2 * PUSH)
+    assert answer.v[0] > 1e-3
 
 
 def test_drives_that_control_positions_hold_the_torque_that_they_report():
