@@ -101,6 +101,14 @@ def test_after_a_gap_in_the_stamps_an_arm_may_be_elsewhere():
     assert check.fault(sine(0.0), 1.0) == ""
 
 
+def test_an_impact_while_states_are_lost_is_accepted():
+    check = make_check()
+    for k in [*range(100), *range(120, 200)]:
+        t, v = 0.002 * k, -2.0 if k < 100 else 2.0
+        state = State(np.full(N, 2.0 * abs(t - 0.2)), np.full(N, v))
+        assert check.fault(state, t) == "", k
+
+
 def test_velocities_that_are_not_used_are_not_checked():
     check, rng = make_check(velocity_error=None), np.random.default_rng(0)
     assert not play(check, lambda state: State(state.q, 1e200 * rng.standard_normal(N)), last=1.6)

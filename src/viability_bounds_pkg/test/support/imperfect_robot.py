@@ -100,9 +100,8 @@ class ImperfectRobot:
     def _report(self):
         """Return the state that is told: mostly too far from the limit, and too slow."""
         declared = self.declared
-        size = self._rng.random(2) if self._rng.random() < 0.3 else (1.0, 1.0)
-        q = self.q - size[0] * declared.position_error * self._harm()
-        return State(q, self.v - size[1] * declared.velocity_error * self._harm())
+        q = self.q - declared.position_error * self._harm()
+        return State(q, self.v - declared.velocity_error * self._harm())
 
     def _answer(self, state):
         """Return the command: mostly as fast as the bounds allow."""
@@ -113,9 +112,7 @@ class ImperfectRobot:
                 state = state.after(command, self._dt)
         lower, upper, viable = self.solver.bounds(*state)
         self.seen.lost += int((~viable).sum())
-        a = np.where(self._harm(0.95) > 0.0, upper, lower)
-        between = self._rng.random(a.shape) < 0.05
-        return np.where(between, self._rng.uniform(lower, upper), a)
+        return np.where(self._harm(0.95) > 0.0, upper, lower)
 
     def _send(self, command, period):
         """Put a command under way; the less it harms, the later it arrives, or never."""
