@@ -38,9 +38,7 @@ def main() -> None:
     limit = loop.config.position_max[JOINT]
     every = round(BETWEEN / loop.dt)
     for title, (_, _, q) in runs.items():
-        print(
-            f"{title}: elbow {np.degrees(q[:, JOINT].max() - limit):+.2f} degrees past its limit"
-        )
+        print(f"{title}: elbow {np.degrees(q[:, JOINT].max() - limit):+.2f}° past its limit")
     with closing(Camera(loop.robot, 0.0)) as camera:
         frames = [
             _frame(camera, runs, limit, k)

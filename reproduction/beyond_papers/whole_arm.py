@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arms with weak motors, with and without the safety filter: tables and pictures.
 
-bash scripts/reproduce.sh whole_arm
-bash scripts/reproduce.sh whole_arm --minutes 30     longer; 2 minutes of each row otherwise
+bash scripts/reproduce.sh whole_arm                  2 minutes of each row
 bash scripts/reproduce.sh whole_arm --row Panda      rows whose names contain it
-bash scripts/reproduce.sh whole_arm --limit 6        s that an arm has for a goal, 30 otherwise
 
 In turns, random postures that can be held, half of the joints next to their limits, and poses of
 the hand in random postures, not all of which can be reached from where the arm is without

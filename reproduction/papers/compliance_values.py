@@ -20,11 +20,10 @@ from compliance_hand import PULL, lead
 from compliance_push import ELBOW, HAND, HAND_FORCE, MODES, ROBOT, judge, push, weakest_direction
 from direct import DirectLoop
 from figure import Figure
+from paper1_integral import PAPER
 
 from viability_bounds_pkg.parameter_files import read_yaml
 
-PAPER: dict[str, Any] = {"integral_lambda": 2.0, "integral_budget": []}
-"""Section IV-A: lambda, and tau_m = 0.1 of the torque limits."""
 ADMITTANCE = 5e-3  # m/s^2 per N, rad/s^2 per N m; Table I
 PUSH, HARD_PUSH = 0.9, 1.3
 """Pushes on the elbow, in what stiction alone holds: 100 and 144 N on the file's arm."""
