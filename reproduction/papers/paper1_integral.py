@@ -191,11 +191,9 @@ LAW_HEADS = (
     "Fig. 5: integral action",
     "error at rest, mm",
     "on the way, mm",
-    "budgets when let go",
-    "at most",
+    "peak torque, budgets",
     "overshoot, mm",
     "within 1 cm after, s",
-    "force swings by, N",
     "",
 )
 
@@ -216,11 +214,9 @@ def figure_5() -> Figure:
                 name,
                 f"{1e3 * rest:.2f}",
                 f"{1e3 * way:.2f}",
-                f"{worst['share_pushed']:.2f}",
                 f"{worst['share']:.2f}",
                 f"{1e3 * worst['overshoot']:.1f}",
                 f"{worst['recovery']:.2f}",
-                f"{worst['swing']:.1f}",
                 _verdict(name, found),
             )
         )
