@@ -14,6 +14,7 @@ from torque_safety_controller.integral_feedback import (
     ArmTerms,
     IntegralFeedback,
     IntegralSettings,
+    LeakyIntegrator,
 )
 from torque_safety_controller.integral_feedback.nullspace import (
     NullspaceCompliance,
@@ -138,6 +139,21 @@ def test_singular_start():
     run.go(compliance, 1.0)
     assert np.abs(run.torques).max() < 15.0
     assert run.errors[-1] < 0.002
+
+
+def test_its_memories_are_leaky_integrals_of_the_task_s_error():
+    """(13), exactly for any step, where J does not change."""
+    run = ComplianceRun("panda")
+    compliance = run.started(unlimited(7, slow_leak_rate=1.0, fast_leak_rate=8.0))
+    slow, fast, s = LeakyIntegrator(1.0, 7), LeakyIntegrator(8.0, 7), np.zeros(7)
+    M, J = run.terms.M, run.terms.J
+    for k, dt in enumerate((0.3, 0.01, 1.0)):
+        a_ref = np.linalg.solve(M, J.T @ np.cos(k + np.arange(6)))  # nothing in the null space
+        s = s + a_ref * dt
+        compliance.torque(run.now, a_ref, dt)
+        a, forgotten = compliance.memory.a, compliance.memory.root / np.sqrt(np.diag(M))
+        np.testing.assert_allclose(a, slow.update(s, dt), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(a - forgotten, fast.update(s, dt), rtol=1e-9, atol=1e-9)
 
 
 # Limits
