@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far commands that come late, or never, take a joint from where it was expected."""
 
+from collections import Counter, defaultdict
 from itertools import product
 
 import pytest
@@ -19,36 +20,30 @@ def acting_commands(delay, jitter, missed):
         gone = "".join("x" if late is None else "." for late in fates)
         if "x" * (missed + 1) in gone:
             continue
+        sent = zip(range(-oldest, 0), fates, strict=True)
+        arrival = {k: k + delay + late for k, late in sent if late is not None}
         for last in range(jitter + 1):
-            arrival = {-oldest + i: fate for i, fate in enumerate(fates) if fate is not None}
-            acting = []
-            for period in range(delay + last):
-                there = [k for k, late in arrival.items() if k + delay + late <= period]
-                if not there:
-                    break
-                acting.append(max(there))
-            else:
-                yield acting
+            there = [
+                [k for k, arrived in arrival.items() if arrived <= period]
+                for period in range(delay + last)
+            ]
+            if all(there):
+                yield [max(each) for each in there]
 
 
-def counts(acting, delay):
-    """Return how often each command acts more than expected, in all and weighted by time.
+def wrong(acting, delay):
+    """Return what commands between 0 and 1 that act instead of those expected do at most.
 
-    The latter is what the position is off in the middle of the period when command 0 should act,
-    had command 0 acted from then on.
+    In periods; and weighted by time: what the position is off in the middle of the period when
+    command 0 should act, had command 0 acted from then on.
     """
-    velocity, position = {}, {}
-    for period, command in enumerate(acting):
-        expected = min(period - delay, 0)
-        for each, sign in ((command, 1.0), (expected, -1.0)):
-            velocity[each] = velocity.get(each, 0.0) + sign
-            position[each] = position.get(each, 0.0) + sign * (delay - period - 0.5)
-    return velocity, position
-
-
-def most(weights):
-    """Return the largest sum that commands between 0 and 1 make."""
-    return max(sum(max(sign * w, 0.0) for w in weights.values()) for sign in (1.0, -1.0))
+    expected = [min(period - delay, 0) for period in range(len(acting))]
+    weights = defaultdict(float)
+    for period, pair in enumerate(zip(acting, expected, strict=True)):
+        for command, sign in zip(pair, (1.0, -1.0), strict=True):
+            weights[command] += sign * (delay - period - 0.5)
+    position = max(sum(max(sign * w, 0.0) for w in weights.values()) for sign in (1.0, -1.0))
+    return (Counter(acting) - Counter(expected)).total(), position
 
 
 @pytest.mark.parametrize(
@@ -58,8 +53,7 @@ def most(weights):
 )
 def test_no_order_of_commands_does_more_than_is_kept_back_for(delay, jitter, missed):
     declared = DeclaredUncertainty(delay=delay, delay_jitter=jitter, missed_deadlines=missed)
-    weights = [counts(acting, delay) for acting in acting_commands(delay, jitter, missed)]
-    velocity = max(most(v) for v, _ in weights)
-    position = max(most(p) for _, p in weights)
+    found = [wrong(acting, delay) for acting in acting_commands(delay, jitter, missed)]
+    velocity, position = map(max, zip(*found, strict=True))
     assert velocity == wrong_periods(declared)
-    assert position <= 0.5 * (delay**2 + jitter**2) * (velocity > 0.0)
+    assert position <= 0.5 * (delay**2 + jitter**2) * (velocity > 0)
