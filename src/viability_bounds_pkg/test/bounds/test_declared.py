@@ -66,6 +66,11 @@ def test_each_declaration_takes_something(name, more):
         assert (left > whole).all()
 
 
+def test_rows_of_missed_deadlines_and_late_commands_lengthen_the_horizon():
+    assert configured(missed_deadlines=1).horizon == 2.0 * 0.002
+    assert configured(missed_deadlines=4, delay_jitter=2).horizon == pytest.approx(7.0 * 0.002)
+
+
 @pytest.mark.parametrize(
     ("changed", "name", "joint"),
     [
