@@ -204,6 +204,7 @@ def with_memory(seed, **changes):
 
 @pytest.mark.parametrize("fast", [0.6, 100.0])
 def test_limiting_cuts_the_torque_as_far_as_that_stores_no_more_energy(fast):
+    """Mostly only the torque of joints beyond their limits; by (10) all would be scaled."""
     in_part = 0
     for seed in range(40):
         run, wide, tight = with_memory(seed, fast_leak_rate=fast)
@@ -211,8 +212,11 @@ def test_limiting_cuts_the_torque_as_far_as_that_stores_no_more_energy(fast):
         budgets = np.abs(free) * np.random.default_rng(seed).uniform(0.3, 2.0, 9)
         tight.settings = replace(tight.settings, budget=budgets)
         got = tight.torque(run.now, run.a_ref, DT)
-        assert tight.saturated.any() and not wide.saturated.any()
+        assert not wide.saturated.any()
         assert (np.abs(got) <= budgets).all()
+        at_limit = np.abs(got) > (1.0 - 1e-6) * budgets
+        assert at_limit.any()
+        np.testing.assert_array_equal(tight.saturated, at_limit)
         gained = energy(tight, run.terms.M) / energy(wide, run.terms.M) - 1.0
         assert gained <= 1e-12
         if np.abs(got - np.clip(free, -budgets, budgets)).max() > 1e-9:
@@ -221,22 +225,7 @@ def test_limiting_cuts_the_torque_as_far_as_that_stores_no_more_energy(fast):
         # Without more error it goes on from there.
         after = tight.torque(run.now, run.a_ref, 0.0)
         np.testing.assert_allclose(after, got, atol=1e-9)
-    assert in_part > 1
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_one_limited_joint_does_not_weaken_the_others(seed):
-    """By (10) all torques would fall to nine tenths; here only the limited joint's does."""
-    run, wide, tight = with_memory(seed)
-    free = wide.torque(run.now, run.a_ref, DT)
-    j = int(np.argmax(np.abs(free)))
-    others = np.arange(9) != j
-    budget = np.where(others, np.inf, 0.9 * np.abs(free))
-    tight.settings = replace(tight.settings, budget=budget)
-    got = tight.torque(run.now, run.a_ref, DT)
-    assert abs(got[j]) == pytest.approx(0.9 * abs(free[j]), rel=1e-9)
-    np.testing.assert_allclose(got[others], free[others], atol=0.02 * np.abs(free).max())
-    assert tight.saturated[j] and not tight.saturated[others].any()
+    assert 1 < in_part < 10
 
 
 def test_it_leaves_its_limits_at_once():
