@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -80,10 +80,6 @@ class JointLimits:
 
     def __len__(self) -> int:
         return len(self.names)
-
-    def of_joint(self, j: int) -> JointLimits:
-        """Return the limits of joint j alone."""
-        return JointLimits(*(getattr(self, each.name)[j : j + 1] for each in fields(self)))
 
 
 def joint_array(field: str, values: ArrayLike, names: Sequence[str]) -> NDArray[np.float64]:
