@@ -117,6 +117,27 @@ def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
     np.testing.assert_allclose(hand.accelerates(enough), 0.0, atol=1e-4)
 
 
+def test_no_stiffness_is_left_where_force_is_controlled():
+    hand = SimulatedHand(force_directions=Z)
+    hand.goals.set_pose(hand.start * pin.SE3(np.eye(3), np.array([0.01, 0.0, 0.02])))
+    hand.interaction.set_target(np.zeros(6))
+    a = hand.accelerates(hand.step(force()))
+    assert a[0] == pytest.approx(GAINS.pose_kp * 0.01, rel=1e-2)
+    assert a[2] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_target_in_the_base_frame_turns_with_the_hand_and_is_forgotten_by_a_reset():
+    hand = SimulatedHand(force_directions=np.ones(6))
+    pressed = np.array([1.0, 2.0, -3.0, 0.1, 0.2, 0.3])
+    hand.interaction.set_target(pressed, np.eye(3))
+    hand.step(np.zeros(6), count=1000)
+    expected = -(pressed.reshape(2, 3) @ hand.start.rotation).ravel()
+    np.testing.assert_allclose(hand.interaction.reference, expected, atol=1e-3)
+    hand.controller.reset(Q)
+    hand.step(np.zeros(6))
+    assert hand.state is Compliance.OFF
+
+
 # Contact
 
 

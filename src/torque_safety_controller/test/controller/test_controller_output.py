@@ -9,11 +9,14 @@ from arms import load_arm
 from controllers import (
     EXACT,
     GAINS,
+    SOLVED,
     VECTORS,
     assert_may_be_sent,
     integral,
     make,
     pose_at,
+    posture_only,
+    strong,
     wide,
 )
 from hypothesis import given, settings
@@ -154,6 +157,19 @@ def test_a_share_of_the_goals_mixes_their_accelerations_with_those_of_braking(ar
     np.testing.assert_allclose(none, rest, atol=1e-3)
     np.testing.assert_allclose(part, 0.25 * all_of_it + 0.75 * rest, atol=1e-3)
     assert np.abs(all_of_it - rest).max() > 0.1
+
+
+def test_what_pushes_is_taken_off_the_bounds_of_what_is_commanded(arm):
+    gains = replace(posture_only(100.0, 20.0), disturbance_time=1e-6)
+    controller = strong(arm, gains=gains)
+    controller.reset(arm.q_start)
+    controller.goals.set_posture(arm.q_start + 1.0)
+    bounds, push = AccelerationRange(np.full(arm.n, -1.0), np.full(arm.n, 1.0)), 0.4
+    v = np.zeros(arm.n)
+    for _ in range(10):
+        step = controller.step(State(arm.q_start, v), bounds)
+        v = v + arm.dt * (step.a + push)
+    np.testing.assert_allclose(step.a + push, 1.0, atol=SOLVED)
 
 
 def test_nothing_is_learned_from_a_motion_that_was_not_commanded():

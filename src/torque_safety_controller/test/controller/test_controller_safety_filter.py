@@ -167,6 +167,22 @@ def test_where_it_cannot_be_held_the_arm_goes_to_no_goal_but_slows_down():
     )
 
 
+def test_a_plan_stays_in_hand_whatever_is_wanted_also_what_no_qp_would():
+    keeper, rng = make_filter(), np.random.default_rng(0)
+    state, least = State(ARM.q_start, ZERO), np.inf
+    for k in range(round(1.5 / ARM.dt)):
+        if k % 30 == 0:
+            wanted = rng.choice([-1e3, 1e3], ARM.n)
+        keeper.update(*state, ZERO, *LIMITS)
+        least = min(least, keeper.slack)
+        a = keeper.passed(np.clip(wanted, keeper.lower, keeper.upper))
+        state = state.after(a, ARM.dt)
+    assert least > -1e-9
+    assert keeper.outcomes["changed"] > 0
+    assert keeper.outcomes["outside"] == 0
+    np.testing.assert_array_equal(keeper.passed(ZERO + np.nan), keeper.plan)
+
+
 def test_plans_leave_a_reserve_and_count_the_torque_that_is_more_than_it():
     """Whatever acts besides, up to the reserve, may change at any time: plans do not see it."""
     reserve = 0.1 * ARM.tau_max
