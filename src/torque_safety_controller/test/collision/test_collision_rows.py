@@ -170,6 +170,17 @@ def test_the_bound_is_that_of_a_joint_with_a_lower_limit():
     assert braked > 10
 
 
+def test_of_too_many_rows_the_nearest_are_returned():
+    limits, few, every = panda()[1], panda_avoidance(rows_max=3), panda_avoidance(rows_max=1000)
+    cut = 0
+    for q, v in random_states(60, speed=2.0, seed=8):
+        nearest = np.sort(every.rows(q, v, limits.a_min, limits.a_max).distance)
+        rows = few.rows(q, v, limits.a_min, limits.a_max)
+        np.testing.assert_array_equal(np.sort(rows.distance), nearest[:3])
+        cut += len(nearest) > 3
+    assert cut > 5
+
+
 def test_no_row_asks_for_what_the_bounds_do_not_allow():
     avoidance = everything()
     broken = 0

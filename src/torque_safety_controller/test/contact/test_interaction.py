@@ -102,6 +102,15 @@ def test_the_task_asks_for_what_equation_27_says(seed):
     np.testing.assert_allclose(robot.J @ a + robot.drift, expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("push", [0.1, 100.0])
+def test_the_hand_does_not_rush(push):
+    """It settles at the speed of (27) against the damping, or at the limit."""
+    direction = np.array([2.0, -1.0, 2.0]) / 3.0
+    g = admittance(-push * np.tile(direction, 2), np.zeros(6), (0.1, 0.2), (0.02, 0.1), 50.0)
+    np.testing.assert_allclose(g[:3] / 50.0, min(0.1 * push / 50.0, 0.02) * direction)
+    np.testing.assert_allclose(g[3:] / 50.0, min(0.2 * push / 50.0, 0.1) * direction)
+
+
 def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
     """The paper's weights: the mean of what the two tasks want, in the direction of force only."""
     hand = SimulatedHand(force_directions=Z)

@@ -102,6 +102,19 @@ def test_the_integral_carries_what_the_model_does_not_know():
     assert errors["task"] < 0.1 * errors["none"]
 
 
+def test_in_hold_nothing_grows_on_what_the_motors_cannot_give(arm):
+    controller = with_integral(arm, gains=replace(GAINS, hold_kd=100.0))
+    q, v = arm.q_start, np.zeros(arm.n)
+    controller.robot.update(State(q, v), v)
+    # So fast that to brake as it should takes 1.8 times what the first motor has.
+    v[0] = 1.8 * arm.tau_max[0] / (100.0 * controller.robot.M[0, 0])
+    for _ in range(8):
+        step = controller.step(State(q, v), None, REST, KHZ)
+        q, v = arm.move(q, v, step.tau, KHZ, steps=2)
+    # With the accelerations that were wished for, half of the budget would be used up by now.
+    assert (np.abs(controller.find(Integral).action.last) < 0.02 * arm.tau_max).all()
+
+
 # The handover
 
 

@@ -159,6 +159,19 @@ def test_a_share_of_the_goals_mixes_their_accelerations_with_those_of_braking(ar
     assert np.abs(all_of_it - rest).max() > 0.1
 
 
+def test_a_far_goal_gets_its_effect_back_without_a_jolt(arm):
+    """However far away it is, and however stiff the gains: the bounds open with the share."""
+    bounds = AccelerationRange(np.full(arm.n, -15.0), np.full(arm.n, 15.0))
+    controller = strong(arm, gains=posture_only(400.0, 40.0))
+    controller.goals.set_posture(arm.q_start + 3.0)
+    last, increment = np.zeros(arm.n), 0.01
+    for share in np.arange(0.0, 1.0, increment):
+        a = controller.step(at_rest(arm), bounds, Order(share)).a
+        assert np.abs(a - last).max() <= 2.0 * increment * 30.0 + SOLVED
+        last = a
+    assert last.max() > 14.0, "the goal has no effect"
+
+
 def test_what_pushes_is_taken_off_the_bounds_of_what_is_commanded(arm):
     gains = replace(posture_only(100.0, 20.0), disturbance_time=1e-6)
     controller = strong(arm, gains=gains)

@@ -199,6 +199,22 @@ def test_jitter_counts_as_the_longer_delay():
         assert jitter[name].limit == pytest.approx(limit.limit, rel=1e-3)
 
 
+def test_the_resolution_limits_each_gain_to_a_twentieth_of_the_torque():
+    """Encoders that all step at once, with the worst of random signs."""
+    found = check(position_error=[1e-5] * N, velocity_error=[1e-3] * N)
+    position, velocity = found.steps
+    by = {limit.name: limit.by_resolution for limit in found.limits()}
+    random = np.random.default_rng(0)
+    worst = 0.0
+    for M in found.inertia.matrices:
+        for signs in random.choice([-1.0, 1.0], (20, N)):
+            torque = M @ (signs * (by["pose_kp"] * position + by["pose_kd"] * velocity))
+            worst = max(worst, (np.abs(torque) / ARM.torque_max).max())
+    assert 0.5 * 0.05 < worst < 1.001 * 0.05
+    own = found.inertia.diagonal * velocity / ARM.torque_max
+    assert (by["integral_lambda"] * own).max() == pytest.approx(0.05)
+
+
 def test_disturbances_are_not_estimated_faster_than_predicted_commands_act():
     """As the observer sees them: predicted velocities, whose commands under way did not act."""
     delay, wanted, acted = 5, 6.0, -6.0
