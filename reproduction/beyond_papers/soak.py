@@ -13,7 +13,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any, NamedTuple
 
@@ -243,12 +243,12 @@ FAULTS: dict[str, Callable[[Soak], None]] = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> int:
     """Run the faults, print a table; return 1 where one was not overcome."""
     parser = argparse.ArgumentParser(prog="reproduce.sh soak", description=__doc__)
     parser.add_argument("--robot", default="panda", help="a file in config/ (panda)")
     parser.add_argument("--rounds", type=int, default=3, help="how often each fault is made (3)")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     found = []
     with ExitStack() as stack:
         soak = Soak(options.robot, stack.enter_context(private_domain()))

@@ -206,14 +206,12 @@ class Pressed(NamedTuple):
     Attributes:
         t: time, s.
         force: of the table on the hand, shape (N, 3), N.
-        place: of the hand, from where it began, shape (N, 3), m.
         slide: begin and end of the sliding, s.
         loop: that was played.
     """
 
     t: np.ndarray
     force: np.ndarray
-    place: np.ndarray
     slide: tuple[float, float]
     loop: DirectLoop
 
@@ -244,11 +242,11 @@ def press(
         force = sum(
             (np.asarray(contact.force) for contact in loop.robot.obstacles.contacts()), np.zeros(3)
         )
-        rows.append((t, force, loop.pose().translation - start.translation))
+        rows.append((t, force))
 
     loop.run(duration, each)
-    t, force, place = (np.array(column) for column in zip(*rows, strict=True))
-    return Pressed(t, force, place, slide, loop)
+    t, force = (np.array(column) for column in zip(*rows, strict=True))
+    return Pressed(t, force, slide, loop)
 
 
 def judge_press(run: Pressed) -> dict[str, float]:
@@ -269,8 +267,6 @@ def judge_press(run: Pressed) -> dict[str, float]:
         "least_after_contact_n": float(normal[settled].min()),
         "error_standing": steady(settled & (run.t < run.slide[0])),
         "error_sliding": steady(sliding),
-        "periods_without_contact": float((normal[touched + 1 :] <= 0.0).sum()),
-        "slid_m": float(np.ptp(run.place[:, 1])),
         "limits_kept": float(within_limits(run.loop)),
     }
 
