@@ -75,8 +75,9 @@ class SlowDown(Part):
         room = np.where(v > 0.0, high - q, q - low) - 2.0 * LATE_PERIODS * self._period * speed
         with np.errstate(divide="ignore", invalid="ignore"):
             brake = np.where(room > 0.0, np.maximum(speed / STOP_TIME, v * v / room), np.inf)
-        inward = np.maximum(share * lower, np.where(v < 0.0, brake, 0.0))
-        outward = np.minimum(share * upper, np.where(v > 0.0, -brake, 0.0))
+            # Bounds may be infinite where there are none.
+            inward = np.maximum(share * lower, np.where(v < 0.0, brake, 0.0))
+            outward = np.minimum(share * upper, np.where(v > 0.0, -brake, 0.0))
         return AccelerationRange(
             np.where(lower > 0.0, np.minimum(inward, lower), lower),
             np.where(upper < 0.0, np.maximum(outward, upper), upper),

@@ -89,3 +89,29 @@ def test_every_joint_returns_although_its_state_is_unsure(name):
     run = bring_back(solver, *states_outside(solver, case, 300, rng), 3000, rng)
     assert run.stray == 0
     assert run.speed <= VIOLATION
+
+
+@pytest.mark.parametrize("name", [name for name in ROOMY if name != "continuous"])
+def test_a_state_is_viable_if_one_within_the_errors_is(name):
+    case, errors = HOLDING[name], errors_of(HOLDING[name])
+    known, unsure = solver_of(case), solver_of(case, **errors)
+    q, v = states_of(case, 20_000, seed=5)
+    fast_and_high = ((v > 0.2 * case[2]) & (q > 0.5 * (case[0] + case[1])))[:, 0]
+    q, v = q[fast_and_high], v[fast_and_high]  # only the upper limit counts
+    off, error = errors.values()
+    expected = known.bounds(q - off, v - error).viable
+    assert 0.1 < expected.mean() < 0.95
+    assert (unsure.bounds(q, v).viable == expected).mean() > 0.9999  # rounding on the edge
+
+
+@pytest.mark.parametrize("name", ROOMY)
+def test_the_lower_limit_is_the_mirror_image_of_the_upper(name):
+    case, errors = HOLDING[name], errors_of(HOLDING[name], 0.01)
+    q_min, q_max, v_max, a_min, a_max, dt = case
+    solver = solver_of(case, 0.01, **errors)
+    image = solver_of((-q_max, -q_min, v_max, -a_max, -a_min, dt), 0.01, **errors)
+    q, v = states_outside(solver, case, 2000, np.random.default_rng(8))
+    found, seen = solver.bounds(q, v), image.bounds(-q, -v)
+    np.testing.assert_array_equal(found.viable, seen.viable)
+    np.testing.assert_allclose(found.lower, -seen.upper, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.upper, -seen.lower, rtol=1e-9, atol=1e-9)
