@@ -19,7 +19,7 @@ from viability_bounds_pkg.state import State
 HASTE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 LASTS = 0.6  # s of a fault
 EVERY = 3.5  # s from one to the next
-SECONDS = 12.5
+SECONDS = 9.0
 
 Lie = Callable[[State, State], State]
 """Returns what is said of a state; the second one is that in which the fault began."""

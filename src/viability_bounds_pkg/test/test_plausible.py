@@ -59,7 +59,7 @@ SPOILT = {
     "far too fast": (lambda state: state._replace(v=1e200 * state.v), TOO_FAST, 0.0),
     "a position leaps": (lambda state: state._replace(q=state.q + 0.4 * JOINT), JUMP, 0.0),
     "a biased velocity": (lambda state: state._replace(v=state.v + JOINT), CONTRADICTION, WINDOW),
-    "at rest elsewhere": (lambda state: State(0.0 * state.q - 1.0, 0.0 * state.v), JUMP, 0.0),
+    "at rest elsewhere": (lambda state: State(0.0 * state.q - 3.0, 0.0 * state.v), JUMP, 0.0),
     "frozen": (lambda state: sine(1.0), CONTRADICTION, 0.06),
     "frozen positions": (lambda state: state._replace(q=sine(1.0).q), CONTRADICTION, 0.06),
     "a frozen position": (frozen_joint, CONTRADICTION, 0.15),

@@ -37,7 +37,7 @@ WINDOW = 0.2
 GAP = 0.1
 """Time between states after which the later one is a new beginning, s; three periods at least."""
 
-STOPPING = 0.35
+STOPPING = 0.8
 """How long an arm whose states are refused may move at its speed limits until it stands, s."""
 
 RESTART_GAP = 1.0
