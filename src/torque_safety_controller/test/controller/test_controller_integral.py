@@ -25,7 +25,7 @@ from hypothesis import strategies as st
 from torque_safety_controller.integral_feedback import MODES
 from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange
-from torque_safety_controller.supervisor import REST
+from torque_safety_controller.supervisor import REST, Order
 from torque_safety_controller.tasks.pose_task import pose_error
 from viability_bounds_pkg.state import State
 
@@ -113,6 +113,18 @@ def test_in_hold_nothing_grows_on_what_the_motors_cannot_give(arm):
         q, v = arm.move(q, v, step.tau, KHZ, steps=2)
     # With the accelerations that were wished for, half of the budget would be used up by now.
     assert (np.abs(controller.find(Integral).action.last) < 0.02 * arm.tau_max).all()
+
+
+@pytest.mark.parametrize("forget", [False, True])
+def test_what_balanced_a_motion_that_has_ended_fades(arm, forget):
+    controller = with_integral(arm)
+    held = 0.1 * arm.tau_max
+    controller.resume(at_rest(arm), wide(arm), gravity(arm, arm.q_start) + held)
+    controller.step(at_rest(arm), wide(arm), Order(forget_integral=forget))
+    for _ in range(round(1.0 / KHZ)):
+        controller.step(at_rest(arm), wide(arm))
+    left = controller.find(Integral).action.last / held
+    assert (left < 0.02).all() if forget else (left > 0.5).all()
 
 
 # The handover
