@@ -35,7 +35,7 @@ def copied(folder, package):
 
 def test_colcon_builds_and_tests_a_copy_of_a_package(tmp_path):
     workspace = copied(tmp_path, "sim_bridge")
-    tests = ["test/node/test_scenario_node.py", "test/node/test_command_stream.py"]
+    tests = ["test/node/test_scenario_node.py", "test/hardware/test_communication.py"]
     colcon(workspace, "test", "--packages-select", "sim_bridge", "--pytest-args", *tests)
     summary = colcon(workspace, "test-result")
     assert int(summary.split("Summary: ")[1].split(" tests")[0]) >= 8

@@ -33,7 +33,7 @@ from sim_bridge.scenario.events import (
 from sim_bridge.scenario.scenario import Scenario
 from viability_bounds_pkg.pose_trajectory import TrajectoryPoint
 from viability_bounds_pkg.ros.messages import pose_message, wrench_message
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, is_subscribed, set_stamp
 
 _IN_FLIGHT_MAX = GOAL_QOS.depth - 2
 """Messages sent but not yet reported as received: a reader's queue is that long."""
@@ -199,10 +199,12 @@ class ScheduledPublisher:
 
     Args:
         node: publishes them.
+        receiver: name of the node that they are for.
         messages: in order of time.
     """
 
-    def __init__(self, node: Node, messages: Sequence[ScheduledMessage]) -> None:
+    def __init__(self, node: Node, receiver: str, messages: Sequence[ScheduledMessage]) -> None:
+        self._node, self._receiver = node, receiver
         kinds = {message.topic: type(message.content) for message in messages}
         self._publishers = {
             topic: node.create_publisher(kind, topic, GOAL_QOS) for topic, kind in kinds.items()
@@ -211,10 +213,9 @@ class ScheduledPublisher:
         self._sent = 0
 
     def without_subscriber(self) -> list[str]:
-        """Return the topics without a subscriber."""
-        return [
-            topic for topic, out in self._publishers.items() if not out.get_subscription_count()
-        ]
+        """Return the topics that the receiver does not subscribe to."""
+        topics = self._publishers
+        return [each for each in topics if not is_subscribed(self._node, each, self._receiver)]
 
     def proceed(self, first: int, pending: int) -> bool:
         """Publish the messages that the receiver has room for.

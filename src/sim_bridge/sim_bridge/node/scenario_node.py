@@ -91,8 +91,12 @@ class ScenarioNode(ArmNode):
         self._first, self._period = 0, 1
         self._refused: dict[str, list[str]] | None = None  # when the messages begin; else None
         frames = config.base_frame, config.end_effectors[0]
-        self._goals = ScheduledPublisher(self, to_controller(config.plan, *frames))
-        self._world = ScheduledPublisher(self, to_robot(config.plan, config.base_frame))
+        self._goals = ScheduledPublisher(
+            self, "controller_node", to_controller(config.plan, *frames)
+        )
+        self._world = ScheduledPublisher(
+            self, "bullet_node", to_robot(config.plan, config.base_frame)
+        )
         self._due = deque(e for e in config.plan.events if isinstance(e, ServiceEvent))
         own = RESET, pause(False), change_parameters("bullet_node", {})
         self._service_clients = {

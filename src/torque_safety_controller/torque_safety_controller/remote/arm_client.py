@@ -25,7 +25,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from torque_safety_controller.node.topics import HAND_POSE, TARGET_JOINT_TRAJECTORY, TARGET_POSE
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.messages import Arrival, JointStateReader, pose_message
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor, set_stamp
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, is_subscribed, make_executor, set_stamp
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, JOINT_STATES, LIMIT_DISTANCES, Topic
 
 Array = NDArray[np.float64]
@@ -137,8 +137,7 @@ class ArmClient:
         self._trajectories = TARGET_JOINT_TRAJECTORY.publisher(self._node)
         self._pushes = self._node.create_publisher(WrenchStamped, "external_wrench", GOAL_QOS)
         try:
-            ready = self._poses.get_subscription_count, self._trajectories.get_subscription_count
-            self._wait(lambda: all(count() for count in ready), timeout, "no controller is heard")
+            self._wait(self._has_controller, timeout, "no controller is heard")
             self.state()
         except NotReachedError:
             self.close()
@@ -155,6 +154,10 @@ class ArmClient:
         self._node.destroy_node()
         self._executor.shutdown()
         rclpy.try_shutdown(context=self._context)
+
+    def _has_controller(self) -> bool:
+        topics = TARGET_POSE.name, TARGET_JOINT_TRAJECTORY.name
+        return all(is_subscribed(self._node, topic, "controller_node") for topic in topics)
 
     def state(self) -> ArmState:
         """Return the next state that comes."""
@@ -232,8 +235,11 @@ class ArmClient:
         message.header.frame_id = link
         part = message.wrench.force
         part.x, part.y, part.z = map(float, force)
-        subscribers = self._pushes.get_subscription_count
-        self._wait(lambda: subscribers() > 0, self._timeout, "no simulated robot is heard")
+        self._wait(
+            lambda: is_subscribed(self._node, "external_wrench", "bullet_node"),
+            self._timeout,
+            "no simulated robot is heard",
+        )
         self._pushes.publish(message)
 
     @contextmanager

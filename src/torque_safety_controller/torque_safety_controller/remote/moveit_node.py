@@ -36,7 +36,7 @@ from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import JointStateReader
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
-from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns, steady_timer
+from viability_bounds_pkg.ros.runtime import is_subscribed, set_stamp, stamp_to_ns, steady_timer
 from viability_bounds_pkg.ros.topics import SLOW_JOINT_STATES
 from viability_bounds_pkg.state import State
 
@@ -123,7 +123,7 @@ class _Outlet:
         """Whether a controller listens; the first question begins to publish."""
         if self._publisher is None:
             self._publisher = TARGET_JOINT_TRAJECTORY.publisher(self._node)
-        return self._publisher.get_subscription_count() > 0
+        return is_subscribed(self._node, TARGET_JOINT_TRAJECTORY.name, "controller_node")
 
     @property
     def others(self) -> bool:

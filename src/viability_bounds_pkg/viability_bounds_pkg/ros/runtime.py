@@ -75,6 +75,12 @@ def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Tim
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
+def is_subscribed(node: Node, topic: str, subscriber: str) -> bool:
+    """Return whether the node of a name subscribes to a topic; others may, as viewers do."""
+    infos = node.get_subscriptions_info_by_topic(topic)
+    return any(each.node_name == subscriber for each in infos)
+
+
 def stamp_to_ns(stamp: Time) -> int:
     """Return a ``builtin_interfaces/Time`` in nanoseconds."""
     return stamp.sec * 1_000_000_000 + stamp.nanosec
