@@ -178,7 +178,6 @@ def test_goals_of_several_nodes_are_not_obeyed_and_the_arm_holds(ros):
     other = rival(ros)
     publisher = other.create_publisher(JOINT_STATES.message, "/target_posture", GOAL_QOS)
     ros.wait_until(lambda: "/theirs/driver" in arm.trouble(), "a report")
-    assert arm.mode() == "TRACKING"  # that there is another is told; nothing was asked for
 
     def both_ask():
         arm.ask(second)
