@@ -106,6 +106,15 @@ def test_answers_are_those_of_the_estimator_with_stamp_and_effort_of_the_state(r
     ros.wait_until(lambda: arm.reported("states_answered") == "12")
 
 
+def test_states_without_velocities_are_answered_with_those_estimated(ros):
+    arm = EstimatorProbe(ros, **COARSE)
+    speed = 0.2
+    for k in range(1, 41):  # no torque is known: the observers follow the positions
+        answer = arm.ask(joint_state(JOINTS, k * PERIOD, HOME + speed * k * DT, ()))
+    np.testing.assert_allclose(answer.velocity, np.full(N, speed), atol=0.1)
+    assert arm.node.commands_heard == 0
+
+
 def test_joints_in_any_order_and_others_with_them(ros):
     arm = EstimatorProbe(ros, delay=1, velocity_estimation=False)
     order = [3, 0, 6, 1, 2, 5, 4]

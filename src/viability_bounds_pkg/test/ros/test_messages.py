@@ -14,6 +14,7 @@ from rclpy.parameter import Parameter
 from viability_bounds_pkg.plausible import PlausibilityCheck
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
 from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
+from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import joint_state
 
 JOINTS = ("a", "b", "c")
@@ -80,6 +81,24 @@ def test_what_is_refused_is_counted_told_once_and_changes_nothing(message, reaso
     assert detail in line
     assert reader.read(joint_state(JOINTS, 3 * SECOND, V, Q), 10.03) is Arrival.NEW
     holds(reader, V, Q, 3 * SECOND)
+
+
+@pytest.mark.parametrize("missing", [[], [math.nan] * 3], ids=["none", "nan"])
+def test_where_velocities_are_not_needed_those_of_the_positions_stand_for_missing_ones(missing):
+    reader = JointStateReader(JOINTS, reset_after=0.5, needs_velocities=False)
+    moved = np.array(Q) + [0.01, 0.0, -0.02]
+    for k, now, q, v in (
+        (100, 10.0, Q, NONE),
+        (101, 10.01, moved, [1.0, 0.0, -2.0]),
+        (1, 11.0, Q, NONE),  # started over
+    ):
+        message = joint_state(JOINTS, k * SECOND // 100, q, missing)
+        assert reader.read(message, now) is Arrival.NEW
+        np.testing.assert_allclose(reader.v, v, atol=1e-9)  # rad/s
+        assert reader.read(message, now) is Arrival.REPEATED
+        answer = reader.with_state(State(reader.q, reader.v + 1.0))
+        np.testing.assert_array_equal(answer.velocity, reader.v + 1.0)
+    assert reader.read(joint_state(JOINTS, SECOND, Q, [math.inf] * 3), 11.01) is Arrival.REFUSED
 
 
 def test_the_same_message_again_is_a_repeat():

@@ -98,7 +98,13 @@ class EstimatorNode(ArmNode):
         self._joints = list(joints)
         self._observers = config.observers
         check = make_plausibility_check(config, config.declared, not config.velocity_estimation)
-        self._reader = JointStateReader(joints, config.state_timeout, self._warn, check)
+        self._reader = JointStateReader(
+            joints,
+            config.state_timeout,
+            self._warn,
+            check,
+            needs_velocities=not config.velocity_estimation,
+        )
         self._period = PeriodCheck(config.dt, self._warn)
         self._refused: Counter[str] = Counter()
         self._commands = CommandReader(joints, self._refused, self._warn)

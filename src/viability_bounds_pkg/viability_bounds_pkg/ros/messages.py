@@ -89,6 +89,8 @@ class JointStateReader:
         reset_after: time without a later stamp after which any is accepted, s.
         warn: told in words when a message is dropped for a reason for the first time.
         check: of what is finite; None to accept it.
+        needs_velocities: whether messages must have them; else, where they are missing or NaN,
+            they are those at which the positions have changed since the last accepted message.
 
     Attributes:
         accepted: how many new states were accepted.
@@ -105,9 +107,10 @@ class JointStateReader:
         reset_after: float = 1.0,
         warn: Warn | None = None,
         check: PlausibilityCheck | None = None,
+        needs_velocities: bool = True,
     ) -> None:
         self._order, self._reset_after = JointOrder(joints), reset_after
-        self._warn, self._check = warn, check
+        self._warn, self._check, self._needs_velocities = warn, check, needs_velocities
         self.accepted = 0
         self.message: JointState | None = None
         self.q, self.v = np.zeros((2, len(joints)))
@@ -131,16 +134,21 @@ class JointStateReader:
         if missing := self._order.find(message.name):
             hint = did_you_mean(missing, message.name)
             return self._refuse("missing joint", f"there is no '{missing}'{hint}")
-        if not len(message.position) == len(message.velocity) == len(message.name):
+        velocity: Sequence[float] = message.velocity
+        if not (self._needs_velocities or velocity):
+            velocity = [math.nan] * len(message.name)
+        if not len(message.position) == len(velocity) == len(message.name):
             sizes = (
                 f"{len(message.name)} names, {len(message.position)} positions, "
                 f"{len(message.velocity)} velocities"
             )
             return self._refuse("wrong size", sizes)
         index = self._order.index
-        q, v = np.array(message.position)[index], np.array(message.velocity)[index]
+        q, v = np.array(message.position)[index], np.array(velocity)[index]
+        if not self._needs_velocities and (missing := np.isnan(v)).any():
+            v = np.where(missing, self._slope(q, stamp), v)
         # The sum is the quick test, NumPy's the exact one, of the joints that count.
-        if not math.isfinite(sum(message.position) + sum(message.velocity)) and not (
+        if not math.isfinite(sum(message.position) + sum(velocity)) and not (
             np.isfinite(q).all() and np.isfinite(v).all()
         ):
             return self._refuse("not finite", "a position or velocity")
@@ -179,7 +187,8 @@ class JointStateReader:
         if message is None:
             raise LookupError("no message was accepted yet")
         self._order.find(message.name)
-        q, v = np.array(message.position), np.array(message.velocity)
+        q = np.array(message.position)
+        v = np.array(message.velocity) if message.velocity else np.zeros_like(q)
         q[self._order.index], v[self._order.index] = state
         return JointState(
             header=message.header,
@@ -188,6 +197,13 @@ class JointStateReader:
             velocity=array("d", v.tobytes()),
             effort=message.effort,
         )
+
+    def _slope(self, q: Array, stamp: int) -> Array:
+        """Return the velocity at which positions have changed since the last accepted message."""
+        if stamp == self.stamp:
+            return self.v
+        known = 0 <= self.stamp < stamp
+        return (q - self.q) / (1e-9 * (stamp - self.stamp)) if known else np.zeros_like(q)
 
     def _refuse(self, reason: str, detail: str = "") -> Arrival:
         count_refusal("joint_states", reason, detail, self.refused, self._warn)
