@@ -235,8 +235,9 @@ def test_an_estimate_without_a_solution_is_held_and_forgotten(ros):
     chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps), v=REST))
 
 
-def test_silence_stops_it_and_a_state_wakes_it(ros):
-    chain = NodeChain(ros, state_timeout=0.2, bounds_timeout=0.1)
+@pytest.mark.parametrize("bounds_timeout", [0.1, 20.0], ids=["short", "long"])
+def test_silence_stops_it_and_a_state_wakes_it(ros, bounds_timeout):
+    chain = NodeChain(ros, state_timeout=0.2, bounds_timeout=bounds_timeout)
     stamp = give_goal(chain)
     chain.await_mode("STOPPED", "no joint state")
     # The one that it knows already, from a robot that waits, and new ones.

@@ -272,10 +272,11 @@ class ControllerNode(ArmNode):
 
     def _watch(self) -> None:
         now, config, states = time.monotonic(), self._config, self._states
+        nothing = self.publisher_watch.trouble or "no joint state"
         if now - states.message_at > _QUIET * config.bounds_timeout:
-            self._supervisor.silent(self.publisher_watch.trouble or "no joint state")
+            self._supervisor.silent(nothing)
         elif states.silent(now):
-            self._supervisor.silent(states.why_refused)
+            self._supervisor.silent(states.why_refused or nothing)
         elif states.waits(now) > config.bounds_timeout:
             self._answer(states.message_stamp, None)
 

@@ -117,7 +117,9 @@ class StateStream(JointStateReader):
 
     @property
     def why_refused(self) -> str:
-        """Why states were dropped since the start, in words."""
+        """Why states were dropped since the start, in words; empty if the last was usable."""
+        if self.message_at <= self.usable_at:
+            return ""
         return "joint states are refused: " + ", ".join(self.refused)
 
 
