@@ -49,6 +49,18 @@ def test_it_begins_at_the_state_and_stays_at_its_end():
     assert not v.any() and not a.any()
 
 
+@pytest.mark.parametrize("first", [0.0, 0.5])
+def test_continuous_joints_go_to_the_nearest_turn_of_the_first_point(first):
+    q = np.array([[0.1, 0.1], [0.3, 0.3]])
+    points = [JointPoint(first + k, q[k]) for k in range(2)]
+    state = State(np.array([2.0 * np.pi, 2.0 * np.pi]), np.zeros(2))
+    moved = JointTrajectory(points).from_state(state, np.array([True, False]))
+    for k in range(2):
+        np.testing.assert_allclose(
+            moved.sample(first + k)[0], q[k] + [2.0 * np.pi, 0.0], atol=1e-12
+        )
+
+
 @pytest.mark.parametrize(
     ("points", "reason"),
     [

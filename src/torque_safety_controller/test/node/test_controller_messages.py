@@ -10,6 +10,7 @@ from geometry_msgs.msg import PoseStamped
 from node_chain import (
     ARM,
     GOAL,
+    GOAL_Q,
     JOINTS,
     LOWER,
     REST,
@@ -158,9 +159,23 @@ def test_goals_that_cannot_be_followed_are_refused_and_counted(ros):
 def test_a_continuous_joint_is_not_sent_to_infinity(ros):
     limits = {"position_min": [*ARM.q_min[:6], -math.inf]}
     chain = NodeChain(ros, **limits, position_max=[*ARM.q_max[:6], math.inf])
-    for last, key, value in ((math.inf, "goals_refused", "1;"), (100.0, "goals_pending", "1")):
+    for last, key, value in (
+        (math.inf, "goals_refused", "1;"),
+        (1e7, "goals_refused", "2;"),
+        (100.0, "goals_pending", "1"),
+    ):
         chain.postures.publish(joint_state(JOINTS, 0, [*Q[:6], last]))
         ros.wait_until(lambda k=key, v=value: v in chain.reported(k), key)
+
+
+def test_a_continuous_joint_takes_the_nearest_turn_to_a_posture(ros):
+    limits = {"position_min": [*ARM.q_min[:6], -math.inf]}
+    chain = NodeChain(ros, **limits, position_max=[*ARM.q_max[:6], math.inf])
+    core = expected(posture=GOAL_Q)
+    chain.postures.publish(joint_state(JOINTS, 0, [*GOAL_Q[:6], GOAL_Q[6] - 2.0 * math.pi]))
+    chain.await_goals()
+    wanted = core.step(State(Q, V), AccelerationRange(LOWER, UPPER)).tau
+    np.testing.assert_allclose(chain.answer(10), wanted, atol=1e-4)  # N m
 
 
 def test_goals_take_effect_at_their_stamps(ros):

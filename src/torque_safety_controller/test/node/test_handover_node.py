@@ -113,6 +113,15 @@ def test_it_goes_over_to_the_torque_of_the_motors_and_back(ros):
     assert (np.abs(chain.take_over(Q, -TAU) + TAU) < SMALL).all()
 
 
+def test_the_drives_hold_a_continuous_joint_in_the_turn_that_they_report(ros):
+    most = np.array([10.0] * (N - 1) + [math.inf])
+    chain = HandoverChain(ros, position_min=(-most).tolist(), position_max=most.tolist())
+    at, turn = np.array([*Q[:-1], math.pi - 1e-3]), np.array([*np.zeros(N - 1), 2.0 * math.pi])
+    assert_position(chain.answer(at), at)
+    wrapped = at - turn + [*np.zeros(N - 1), 2e-3]
+    np.testing.assert_allclose(chain.answer(wrapped).position, at - turn, atol=1e-12)
+
+
 def test_a_state_asked_for_again_gets_what_it_got(ros):
     chain = HandoverChain(ros)
     chain.answer()

@@ -19,7 +19,7 @@ from scipy.interpolate import CubicHermiteSpline, PchipInterpolator, PPoly
 from torque_safety_controller.controller import Controller
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, quintic
-from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state import State, whole_turns
 
 Array = NDArray[np.float64]
 
@@ -105,9 +105,20 @@ class JointTrajectory:
         if not (fastest <= SPEED_MAX).all():
             raise JointTrajectoryError(f"it is faster than {SPEED_MAX:g} rad/s")
 
-    def from_state(self, state: State) -> JointTrajectory:
-        """Return this trajectory with a first part that begins at a state at time 0."""
+    def from_state(
+        self, state: State, continuous: NDArray[np.bool_] | None = None
+    ) -> JointTrajectory:
+        """Return this trajectory with a first part that begins at a state at time 0.
+
+        Args:
+            state: of the joints.
+            continuous: whether a joint turns without end, shape (n,): whole turns are added to all
+                its positions, so that the first is the nearest; None for no joint.
+        """
         first = self.points[0]
+        if continuous is not None and (turns := whole_turns(first.q, state.q, continuous)).any():
+            points = [each._replace(q=each.q + turns) for each in self.points]
+            return JointTrajectory(points).from_state(state)
         if first.time <= 0.0:
             return self
         start = JointPoint(
@@ -165,12 +176,19 @@ class JointMotion:
         q_min: lower position limits, shape (n,), rad; between points a polynomial may pass them.
         q_max: upper ones, shape (n,), rad.
         v_max: speed limits, shape (n,), rad/s; more is not fed forward.
+        continuous: see `JointTrajectory.from_state`.
     """
 
     def __init__(
-        self, trajectory: JointTrajectory, begin: int, q_min: Array, q_max: Array, v_max: Array
+        self,
+        trajectory: JointTrajectory,
+        begin: int,
+        q_min: Array,
+        q_max: Array,
+        v_max: Array,
+        continuous: NDArray[np.bool_] | None = None,
     ) -> None:
-        self._trajectory, self._begin = trajectory, begin
+        self._trajectory, self._begin, self._continuous = trajectory, begin, continuous
         self._q_min, self._q_max, self._v_max = q_min, q_max, v_max
         self._begun = False
 
@@ -178,7 +196,7 @@ class JointMotion:
         """Set the goal of one control step; see `Motion`."""
         if not self._begun:
             self._begun, self._begin = True, self._begin or stamp
-            self._trajectory = self._trajectory.from_state(state)
+            self._trajectory = self._trajectory.from_state(state, self._continuous)
         t = 1e-9 * (stamp - self._begin)
         q, v, a = self._trajectory.sample(t)
         controller.goals.release_pose()

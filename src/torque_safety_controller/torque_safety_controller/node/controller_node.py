@@ -71,7 +71,9 @@ class ControllerNode(ArmNode):
         if not config.use_estimated_states:
             errors = None if declared is None else declared.declared
             check = make_plausibility_check(config, errors)
-        self._states = StateStream(config.joints, config.state_timeout, self._warn, check)
+        self._states = StateStream(
+            config.joints, config.state_timeout, self._warn, check, config.continuous
+        )
         self._limits = LimitsReader(config.joints, self._warn)
         self._goals = GoalSubscriber(self, self._controller, config, base, self._states)
         self._wrenches = WrenchSubscriber(
@@ -167,7 +169,7 @@ class ControllerNode(ArmNode):
             return
         states.refused_in_row += 1
         if self._supervisor.by_drives:
-            self._commands.position(self._handover.hold(states.q), stamp)
+            self._hold(stamp)
         elif states.refused_in_row == UNSEEN:
             self._supervisor.refused(states.why_refused)
 
@@ -199,7 +201,7 @@ class ControllerNode(ArmNode):
             goal = self._goals.trouble
         order = supervisor.state(elapsed, state.v, states.effort(), limits is not None, goal)
         if supervisor.by_drives:
-            self._commands.position(self._handover.hold(state.q), stamp)
+            self._hold(stamp)
             states.mark_answered()
             if supervisor.control is Control.TAKING_OVER and limits is not None:
                 self._take_over(state, limits)
@@ -213,6 +215,11 @@ class ControllerNode(ArmNode):
         self._wrenches.log_changes()
 
     # Handover
+
+    def _hold(self, stamp: Any) -> None:
+        """Have the drives hold the arm, in the turns in which they report continuous joints."""
+        states = self._states
+        self._commands.position(self._handover.hold(states.q) - states.turns, stamp)
 
     def _take_over(self, state: State, limits: AccelerationRange) -> None:
         """Prepare to go on with torque from the next state, if that of the motors is known."""

@@ -20,6 +20,7 @@ from torque_safety_controller.driving.trajectory import (
     JointTrajectoryError,
 )
 from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
+from viability_bounds_pkg.plausible import FARTHEST
 from viability_bounds_pkg.pose_trajectory import (
     PoseTrajectory,
     TrajectoryError,
@@ -198,7 +199,7 @@ def _check_complete(names: Sequence[str], joints: Sequence[str]) -> None:
 
 
 def _check_positions(q: Array, config: RobotConfiguration, where: str = "") -> None:
-    limits = config.joints, q, config.position_min, config.position_max
-    for joint, value, low, high in zip(*limits, strict=True):
-        if not (math.isfinite(value) and low <= value <= high):
+    limits = np.clip((config.position_min, config.position_max), -FARTHEST, FARTHEST)
+    for joint, value, low, high in zip(config.joints, q, *limits, strict=True):
+        if not low <= value <= high:
             raise GoalRefused(f"{where}{joint} is {value:g} rad; allowed: {low:g} to {high:g}")

@@ -43,7 +43,7 @@ from torque_safety_controller.parameters.controller_parameters import Controller
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import Topic
-from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state import State, whole_turns
 
 Array = NDArray[np.float64]
 
@@ -186,7 +186,8 @@ class GoalSubscriber:
         def apply() -> None:
             if not isinstance(self.motion, TrajectoryMotion):  # which leaves the posture to others
                 self.motion = None
-            self._controller.goals.set_posture(q_des)
+            turns = whole_turns(q_des, self._states.q, self._config.continuous)
+            self._controller.goals.set_posture(q_des + turns)
 
         self.add(message, apply)
 
@@ -211,7 +212,8 @@ class GoalSubscriber:
                 f"{excess[worst]:.3g} times its velocity_max: the arm falls behind"
             )
         limits = config.position_min, config.position_max, config.velocity_max
-        motion = JointMotion(trajectory, stamp_to_ns(message.header.stamp), *limits)
+        begin = stamp_to_ns(message.header.stamp)
+        motion = JointMotion(trajectory, begin, *limits, config.continuous)
         self.add(message, lambda: self._move(motion))
 
     def _on_hand_jog(self, message: TwistStamped) -> None:

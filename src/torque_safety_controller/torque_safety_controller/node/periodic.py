@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
@@ -37,6 +38,7 @@ class StateStream(JointStateReader):
         timeout: how long without a usable state until the arm counts as silent, s.
         warn: told in words when a state is dropped for a reason for the first time.
         check: of what is finite; None to accept it.
+        continuous: see `JointStateReader`.
 
     Attributes:
         message_at: when the last message came, usable or not, s on the steady clock.
@@ -56,8 +58,9 @@ class StateStream(JointStateReader):
         timeout: float,
         warn: Callable[[str], object] | None = None,
         check: PlausibilityCheck | None = None,
+        continuous: NDArray[np.bool_] | None = None,
     ) -> None:
-        super().__init__(joints, timeout, warn, check)
+        super().__init__(joints, timeout, warn, check, continuous=continuous)
         self._timeout = timeout
         self.message_at = self.usable_at = self.waiting_since = -math.inf
         self.message_stamp: Any = None

@@ -27,6 +27,7 @@ from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.messages import Arrival, JointStateReader, pose_message
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, is_subscribed, make_executor, set_stamp
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, JOINT_STATES, LIMIT_DISTANCES, Topic
+from viability_bounds_pkg.state import whole_turns
 
 Array = NDArray[np.float64]
 
@@ -204,7 +205,7 @@ class ArmClient:
         """Send the joints to positions, and wait until they are there.
 
         Args:
-            q: where to, shape (n,), rad.
+            q: where to, shape (n,), rad; those of continuous joints in any turn.
             duration: of the motion, s of the robot's time.
             timeout: how long to wait, s.
             near: distance of each joint that counts as there, rad.
@@ -217,9 +218,11 @@ class ArmClient:
         set_stamp(point.time_from_start, round(1e9 * duration))
 
         def there() -> bool:
-            if JOINT_STATES.name not in self._heard:
+            if not {JOINT_STATES.name, LIMIT_DISTANCES.name} <= self._heard.keys():
                 return False
-            return bool(np.abs(self._by_joint(JOINT_STATES)[0] - target).max() < near)
+            q, distance = (self._by_joint(each)[0] for each in (JOINT_STATES, LIMIT_DISTANCES))
+            nearest = target + whole_turns(target, q, np.isinf(distance))
+            return bool(np.abs(q - nearest).max() < near)
 
         self._trajectories.publish(JointTrajectory(joint_names=self._joints, points=[point]))
         self._arrive(there, timeout)

@@ -73,6 +73,8 @@ class Execution:
     """How long after the end of the trajectory the arm may be on its way, s."""
     begin: int = 0
     """Time 0 of the trajectory, ns; 0 for when it is sent."""
+    continuous: NDArray[np.bool_] | None = None
+    """Whether a joint turns without end, shape (n,); None for no joint."""
     desired: tuple[Array, Array, Array] = field(init=False)
     off: tuple[Array, Array] = field(init=False)
     why: str = field(init=False, default="")
@@ -80,7 +82,7 @@ class Execution:
     def start(self, state: State, stamp: int) -> None:
         """Start the trajectory from a state, at `stamp`, ns, as the controller does."""
         self.begin = self.begin or stamp
-        self.trajectory = self.trajectory.from_state(state)
+        self.trajectory = self.trajectory.from_state(state, self.continuous)
 
     def judge(self, state: State, stamp: int) -> Progress:
         """Judge a state of the arm with a stamp, ns."""

@@ -164,7 +164,7 @@ class MoveitNode(ArmNode):
         self._server: ActionServer | None = None
         with self.starting():
             self._config = NodeParameters(self, MoveitConfiguration).configuration
-        self._reader = JointStateReader(self._config.joints)
+        self._reader = JointStateReader(self._config.joints, continuous=self._config.continuous)
         SLOW_JOINT_STATES.subscription(self, self._on_state)
         CONTROLLER_MODE.subscription(self, self._on_mode)
         self._server = ActionServer(
@@ -232,7 +232,7 @@ class MoveitNode(ArmNode):
                 "has passed",
                 Result.OLD_HEADER_TIMESTAMP,
             )
-        return Execution(joints, trajectory, path, end, patience, begin)
+        return Execution(joints, trajectory, path, end, patience, begin, config.continuous)
 
     async def _answer(self, handle: ServerGoalHandle) -> Any:
         """Return the result of a goal when it has ended."""

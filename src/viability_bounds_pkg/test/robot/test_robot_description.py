@@ -7,7 +7,10 @@ import pytest
 import yaml
 
 from viability_bounds_pkg.cli.limits_file import read_robot
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.parameter_files import ParameterFileError
+from viability_bounds_pkg.robot.configuration import RobotConfiguration, check_with_urdf
 from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     build_model,
@@ -24,6 +27,17 @@ ROTORS = np.linspace(0.0, 0.6, 7)  # kg m^2
 @pytest.fixture(scope="module")
 def urdf():
     return read_urdf(PANDA)
+
+
+def test_a_joint_that_slides_needs_position_limits():
+    values = {"robot_description": "topic", "joints": ["lift"], "torque_max": [50.0]}
+    endless = {"position_min": [-np.inf], "position_max": [np.inf]}
+    config = read(RobotConfiguration, values | endless)
+    assert config.continuous.all()
+    urdf = '<robot name="x"><joint name="lift" type="{}"/></robot>'
+    assert not check_with_urdf(config, urdf.format("continuous"))
+    with pytest.raises(SettingError, match="'position_max' .* finite for lift: it slides"):
+        check_with_urdf(config, urdf.format("prismatic"))
 
 
 def test_rotors_are_on_the_diagonal_of_the_inertia_matrix(urdf):

@@ -101,6 +101,26 @@ def test_where_velocities_are_not_needed_those_of_the_positions_stand_for_missin
     assert reader.read(joint_state(JOINTS, SECOND, Q, [math.inf] * 3), 11.01) is Arrival.REFUSED
 
 
+def test_a_continuous_joint_does_not_leap_where_its_angle_wraps():
+    limit = np.array([math.inf, 4.0, 4.0])
+    check = PlausibilityCheck(-limit, limit, np.full(3, 2.5), 0.01, NONE, NONE)
+    continuous = np.isinf(limit)
+    reader = JointStateReader(JOINTS, reset_after=0.5, check=check, continuous=continuous)
+    true = 3.1 + 0.02 * np.arange(8)
+    for k, q in enumerate(true, 1):
+        wrapped = (q + np.pi) % (2.0 * np.pi) - np.pi
+        message = joint_state(JOINTS, k * SECOND // 100, [wrapped, 3.1, -3.1], [2.0, 0.0, 0.0])
+        assert reader.read(message, 10.0 + 0.01 * k) is Arrival.NEW
+        assert reader.read(message, 10.0 + 0.01 * k) is Arrival.REPEATED
+        np.testing.assert_allclose(reader.q, [q, 3.1, -3.1], atol=1e-12)  # rad
+        np.testing.assert_allclose(reader.q - reader.turns, message.position, atol=1e-12)
+        answer = reader.with_state(State(reader.q, reader.v))
+        np.testing.assert_allclose(answer.position, message.position, atol=1e-12)
+    assert wrapped < 0.0
+    other = joint_state(JOINTS, 9 * SECOND // 100, [wrapped, -3.1, -3.1], NONE)
+    assert reader.read(other, 10.1) is Arrival.REFUSED  # it has limits
+
+
 def test_the_same_message_again_is_a_repeat():
     reader = make_reader()
     for now in (10.1, 100.0):

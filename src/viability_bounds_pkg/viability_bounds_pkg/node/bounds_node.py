@@ -64,7 +64,9 @@ class BoundsNode(ArmNode):
         check = None
         if not config.use_estimated_states:
             check = make_plausibility_check(config, config.declared)
-        self._reader = JointStateReader(joints, config.state_timeout, self._warn, check)
+        self._reader = JointStateReader(
+            joints, config.state_timeout, self._warn, check, continuous=config.continuous
+        )
         self._period = PeriodCheck(config.dt, self._warn)
         self._answered = 0
         self._outside = np.zeros(len(joints), dtype=int)

@@ -104,6 +104,7 @@ class EstimatorNode(ArmNode):
             self._warn,
             check,
             needs_velocities=not config.velocity_estimation,
+            continuous=config.continuous,
         )
         self._period = PeriodCheck(config.dt, self._warn)
         self._refused: Counter[str] = Counter()

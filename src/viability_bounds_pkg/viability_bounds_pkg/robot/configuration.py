@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import ClassVar
 from xml.etree import ElementTree
 
@@ -115,6 +115,11 @@ class RobotConfiguration:
             elif name not in self.NOT_NEEDED:
                 lacking = f"{LIMITS_OF_URDF[name]} limit of {self.joints[limits.index(None)]}"
                 raise SettingError(name, None, f"given, as the URDF has no {lacking}")
+
+    @cached_property
+    def continuous(self) -> NDArray[np.bool_]:
+        """Whether a joint turns without end, as it has no position limits, shape (n,)."""
+        return np.isneginf(self.position_min) & np.isposinf(self.position_max)
 
     @property
     def locked(self) -> dict[str, float]:
@@ -246,6 +251,8 @@ def _unusual(config: RobotConfiguration, j: int, joint: ElementTree.Element) -> 
         if _TURNS_MAX < turns < math.inf:
             allowed = f"rad; {values[j]:g} of {name} are {turns:.0f} turns: degrees?"
             raise SettingError(parameter, values, allowed)
+    if joint.get("type") == "prismatic" and config.continuous[j]:
+        raise SettingError("position_max", config.position_max, f"finite for {name}: it slides")
     for parameter, key in LIMITS_OF_URDF.items():
         values, of_urdf = getattr(config, parameter, ()), _limit(joint, key)
         if not len(values) or of_urdf is None or math.isinf(of_urdf):

@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.plausible import PlausibilityCheck
 from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
-from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state import State, whole_turns
 
 Array = NDArray[np.float64]
 Warn = Callable[[str], object]
@@ -91,11 +91,15 @@ class JointStateReader:
         check: of what is finite; None to accept it.
         needs_velocities: whether messages must have them; else, where they are missing or NaN,
             they are those at which the positions have changed since the last accepted message.
+        continuous: whether a joint turns without end, shape (n,): its driver may report angles in
+            any turn; None for no joint.
 
     Attributes:
         accepted: how many new states were accepted.
         message: the last accepted one; None before the first.
         q, v: its position and velocity, shape (n,), rad and rad/s.
+        turns: whole turns by which continuous joints are in `q` beyond what the message has, so
+            that they do not leap, shape (n,), rad.
         stamp: its stamp, ns.
         heard_at: when it came, or was repeated last, s.
         refused: how many messages were dropped, by reason.
@@ -108,12 +112,14 @@ class JointStateReader:
         warn: Warn | None = None,
         check: PlausibilityCheck | None = None,
         needs_velocities: bool = True,
+        continuous: NDArray[np.bool_] | None = None,
     ) -> None:
         self._order, self._reset_after = JointOrder(joints), reset_after
         self._warn, self._check, self._needs_velocities = warn, check, needs_velocities
+        self._continuous = continuous if continuous is not None and continuous.any() else None
         self.accepted = 0
         self.message: JointState | None = None
-        self.q, self.v = np.zeros((2, len(joints)))
+        self.q, self.v, self.turns = np.zeros((3, len(joints)))
         self.stamp = -1
         self.heard_at = -math.inf
         self.refused: Counter[str] = Counter()
@@ -145,13 +151,18 @@ class JointStateReader:
             return self._refuse("wrong size", sizes)
         index = self._order.index
         q, v = np.array(message.position)[index], np.array(velocity)[index]
-        if not self._needs_velocities and (missing := np.isnan(v)).any():
-            v = np.where(missing, self._slope(q, stamp), v)
+        unknown = None
         # The sum is the quick test, NumPy's the exact one, of the joints that count.
-        if not math.isfinite(sum(message.position) + sum(velocity)) and not (
-            np.isfinite(q).all() and np.isfinite(v).all()
-        ):
-            return self._refuse("not finite", "a position or velocity")
+        if not math.isfinite(sum(message.position) + sum(velocity)):
+            unknown = np.isnan(v) & (not self._needs_velocities)
+            if not (np.isfinite(q).all() and (np.isfinite(v) | unknown).all()):
+                return self._refuse("not finite", "a position or velocity")
+        turns = self.turns
+        if self._continuous is not None and self.message is not None:
+            turns = whole_turns(q, self.q, self._continuous)
+            q = q + turns
+        if unknown is not None and unknown.any():
+            v = np.where(unknown, self._slope(q, stamp), v)
         if stamp == self.stamp:
             if np.array_equal(q, self.q) and np.array_equal(v, self.v):
                 self.heard_at = now
@@ -165,6 +176,7 @@ class JointStateReader:
         if self._check is not None and (fault := self._check.fault(State(q, v), 1e-9 * stamp)):
             return self._refuse("impossible", fault)
         self.q, self.v, self.stamp, self.message = q, v, stamp, message
+        self.turns = turns
         self.heard_at = now
         self.accepted += 1
         return Arrival.NEW
@@ -182,14 +194,17 @@ class JointStateReader:
         return tau if np.isfinite(tau).all() else None
 
     def with_state(self, state: State) -> JointState:
-        """Return the last accepted message with another state of the joints, all else as it is."""
+        """Return the last accepted message with another state of the joints, all else as it is.
+
+        Continuous joints are in the turns of the message.
+        """
         message = self.message
         if message is None:
             raise LookupError("no message was accepted yet")
         self._order.find(message.name)
         q = np.array(message.position)
         v = np.array(message.velocity) if message.velocity else np.zeros_like(q)
-        q[self._order.index], v[self._order.index] = state
+        q[self._order.index], v[self._order.index] = state.q - self.turns, state.v
         return JointState(
             header=message.header,
             name=message.name,
