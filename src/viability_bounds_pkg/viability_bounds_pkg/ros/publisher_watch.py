@@ -67,7 +67,8 @@ class PublisherWatch:
             if not known:
                 self._node.get_logger().warning(
                     f"'{topic}' has {len(names)} publishers: {', '.join(names)}; stop all but "
-                    "one, or keep them apart by namespace or ROS_DOMAIN_ID"
+                    "one, remap the topic of the others, or keep them apart by namespace or "
+                    "ROS_DOMAIN_ID"
                 )
         elif known:
             del self.rivals[topic]
