@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectories of the joints: between points, at their ends, from a state, refused."""
 
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import numpy as np
+import pinocchio as pin
 import pytest
 from scipy.interpolate import BPoly
 
@@ -9,7 +13,10 @@ from torque_safety_controller.driving.trajectory import (
     JointPoint,
     JointTrajectory,
     JointTrajectoryError,
+    TrajectoryMotion,
+    TrajectoryPassed,
 )
+from viability_bounds_pkg.pose_trajectory import PoseTrajectory, TrajectoryPoint
 from viability_bounds_pkg.state import State
 
 RNG = np.random.default_rng(3)
@@ -76,3 +83,39 @@ def test_continuous_joints_go_to_the_nearest_turn_of_the_first_point(first):
 def test_refused(points, reason):
     with pytest.raises(JointTrajectoryError, match=reason), np.errstate(all="ignore"):
         JointTrajectory([JointPoint(t, *map(np.array, parts)) for t, *parts in points])
+
+
+# Late ones
+
+LATE = [(0.2, 0.0, ""), (3.0, None, ""), (3.0, 0.0, "away from"), (8.0, None, "has ended")]
+
+
+def refused(why):
+    return pytest.raises(TrajectoryPassed, match=why) if why else nullcontext()
+
+
+@pytest.mark.parametrize(("late", "q", "why"), LATE)
+def test_a_late_one_is_joined_only_where_the_joints_are(late, q, why):
+    points = [JointPoint(t, np.array([q]), np.zeros(1)) for t, q in ((2.0, 0.9), (6.0, 1.2))]
+    trajectory = JointTrajectory(points)
+    at = trajectory.sample(late)[0] + 0.05 if q is None else np.array([q])
+    with refused(why):
+        trajectory.check_late(late, State(at, np.zeros(1)))
+
+
+@pytest.mark.parametrize(("late", "x", "why"), LATE)
+def test_a_late_one_is_joined_only_where_the_hand_is(late, x, why):
+    places = ((0.0, 0.0), (2.0, 0.9), (6.0, 1.2))
+    points = [
+        TrajectoryPoint(t, pin.SE3(np.eye(3), np.array([x, 0.0, 0.0])), np.zeros(6), np.zeros(6))
+        for t, x in places
+    ]
+    trajectory, at = PoseTrajectory(points), pin.SE3.Identity()
+    if x is None:
+        at.translation = trajectory.sample(late)[0].translation + 0.02
+    controller = SimpleNamespace(robot=SimpleNamespace(pose=at))
+    begin = 10**9
+    with refused(why):
+        TrajectoryMotion(trajectory, begin).check_late(
+            controller, State(np.zeros(1), np.zeros(1)), begin + round(1e9 * late)
+        )

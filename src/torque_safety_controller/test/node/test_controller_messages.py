@@ -2,6 +2,7 @@
 """Messages of the controller node: states, limits, goals, torques, and what tools are shown."""
 
 import math
+import time
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from node_chain import (
 from rclpy.qos import qos_profile_system_default
 from std_msgs.msg import Float64MultiArray, String
 
+from torque_safety_controller.node import goals
 from torque_safety_controller.node.goal_messages import pose_from_message
 from torque_safety_controller.node.periodic import StateStream
 from torque_safety_controller.qp import AccelerationRange
@@ -191,6 +193,31 @@ def test_goals_take_effect_at_their_stamps(ros):
         wanted = core.step(State(Q, V), AccelerationRange(LOWER, UPPER)).tau
         np.testing.assert_allclose(chain.answer(stamp), wanted, atol=1e-4, err_msg=f"{stamp} ms")
     chain.await_goals(0)
+
+
+def test_a_goal_that_waits_is_told_and_one_of_another_clock_is_refused(ros, monkeypatch, capfd):
+    monkeypatch.setattr(goals, "WAITING_MAX", 2)
+    chain = NodeChain(ros, goal_ahead_max=2.0)
+
+    def send(stamp, refused):
+        chain.poses.publish(pose_message(GOAL, stamp=stamp))
+        told = f"target_pose: {refused};"
+        ros.wait_until(lambda: told in chain.reported("goals_refused"), told)
+
+    chain.poses.publish(pose_message(GOAL, stamp=time.time_ns()))
+    chain.await_goals()  # no state says yet which time the robot has
+    chain.answer(10)
+    chain.await_goals(0)
+    send(time.time_ns(), refused=2)
+    told = capfd.readouterr().err
+    assert told.count("that of the joint states: it is the wall clock's, the robot has anoth") == 2
+    send(3000 * MS, refused=3)
+    assert "2.99 s ahead of that of the joint states; allowed: 2 s, or 0" in capfd.readouterr().err
+    for _ in range(2):
+        chain.poses.publish(pose_message(GOAL, stamp=1510 * MS))
+    send(1510 * MS, refused=4)
+    assert chain.reported("goals_pending") == "2"
+    assert "; target_pose due in 1.5 s" in chain.reported("message")
 
 
 # Torques

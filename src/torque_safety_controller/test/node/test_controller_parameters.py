@@ -104,6 +104,7 @@ def test_bad_values_are_refused_and_the_old_ones_stay(ros):
         ({"torque_reserve": [1e3] * 7}, "torque_reserve", "less than 0.97 of torque_max"),
         ({"posture_weight": 0.0}, "posture_weight", "> 0"),
         ({"bounds_timeout": 0.0}, "bounds_timeout", "> 0"),
+        ({"goal_ahead_max": 0.0}, "goal_ahead_max", "> 0"),
     ],
 )
 def test_it_does_not_start_with_bad_parameters(shared_ros, changed, name, shown):

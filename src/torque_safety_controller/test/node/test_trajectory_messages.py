@@ -115,3 +115,9 @@ def test_it_is_followed_in_the_robots_time(ros):
         np.testing.assert_allclose(found, wanted, atol=1e-4, err_msg=f"at {stamp} ms")  # N m
     # It ends where it began.
     ros.wait_until(lambda: float(chain.reported("position_error_m") or "nan") < 1e-6)
+    # And is not followed a second time when its time has passed.
+    chain.ask(1000, q, v)
+    goals.publish(message_of(points, stamp=20 * MS, frame=""))
+    chain.await_goals()
+    chain.ask(1002, q, v)
+    ros.wait_until(lambda: "target_trajectory: 1" in chain.reported("goals_refused"))

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator, PPoly
 
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.driving.jog import HAND_LEAD, JOINT_LEAD, TIMEOUT
+from torque_safety_controller.tasks.pose_task import pose_error
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, quintic
 from viability_bounds_pkg.state import State, whole_turns
@@ -45,6 +47,15 @@ class Motion(Protocol):
 
 class JointTrajectoryError(ArmSafetyError, ValueError):
     """Points that do not make a trajectory."""
+
+
+class TrajectoryPassed(ArmSafetyError, ValueError):
+    """A trajectory that began long ago, and has ended or is not where the arm is."""
+
+    def __init__(self, late: float, why: str = "has ended") -> None:
+        super().__init__(
+            f"header.stamp is {late:.3g} s before that of the joint states: the trajectory {why}"
+        )
 
 
 class JointPoint(NamedTuple):
@@ -132,6 +143,25 @@ class JointTrajectory:
         except JointTrajectoryError:  # no time to get there
             return self
 
+    def check_late(
+        self, late: float, state: State, continuous: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Raise `TrajectoryPassed` where an arm cannot join it any more.
+
+        Args:
+            late: time since it began, s; up to `TIMEOUT` it counts as in time.
+            state: of the joints now.
+            continuous: see `from_state`.
+        """
+        if late <= TIMEOUT:
+            return
+        if late >= self.duration:
+            raise TrajectoryPassed(late)
+        off = float(np.abs(self.from_state(state, continuous).sample(late)[0] - state.q).max())
+        if off > JOINT_LEAD:
+            why = f"is {off:.3g} rad away from the arm by now; allowed: {JOINT_LEAD:g} rad"
+            raise TrajectoryPassed(late, why)
+
     def sample(self, t: float) -> tuple[Array, Array, Array]:
         """Return positions, velocities and accelerations at time t, s; shape (n,) each."""
         first, last = self.points[0], self.points[-1]
@@ -192,6 +222,12 @@ class JointMotion:
         self._q_min, self._q_max, self._v_max = q_min, q_max, v_max
         self._begun = False
 
+    def check_late(self, controller: Controller, state: State, stamp: int) -> None:
+        """Raise `TrajectoryPassed` where the arm cannot join it any more."""
+        if self._begin:
+            late = 1e-9 * (stamp - self._begin)
+            self._trajectory.check_late(late, state, self._continuous)
+
     def advance(self, controller: Controller, state: State, stamp: int) -> bool:
         """Set the goal of one control step; see `Motion`."""
         if not self._begun:
@@ -218,6 +254,19 @@ class TrajectoryMotion:
 
     def __init__(self, trajectory: PoseTrajectory, begin: int) -> None:
         self._trajectory, self._begin = trajectory, begin
+
+    def check_late(self, controller: Controller, state: State, stamp: int) -> None:
+        """Raise `TrajectoryPassed` where the hand cannot join it any more."""
+        late = 1e-9 * (stamp - self._begin)
+        if not self._begin or late <= TIMEOUT:
+            return
+        if late >= self._trajectory.duration:
+            raise TrajectoryPassed(late)
+        error = pose_error(controller.robot.pose, self._trajectory.sample(late)[0])
+        far, turned = (float(np.linalg.norm(part)) for part in np.split(error, 2))
+        if far > HAND_LEAD[0] or turned > HAND_LEAD[1]:
+            why = f"is {far:.3g} m and {turned:.3g} rad away from the hand by now; allowed: "
+            raise TrajectoryPassed(late, why + "{:g} m and {:g} rad".format(*HAND_LEAD))
 
     def advance(self, controller: Controller, state: State, stamp: int) -> bool:
         """Set the goal of one control step; see `Motion`."""

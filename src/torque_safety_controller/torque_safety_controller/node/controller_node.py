@@ -103,7 +103,7 @@ class ControllerNode(ArmNode):
                 "limits_refused": self._limits.refused,
                 "wrenches_refused": self._wrenches.refused,
             },
-            lambda: len(self._goals),
+            self._goals,
         )
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         self._published = StatePublisher(self, self._controller.robot, config, base, self._states)

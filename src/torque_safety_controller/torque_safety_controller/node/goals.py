@@ -6,22 +6,27 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.driving.jog import HAND_SPEED_MAX, TIMEOUT, HandJog, JointJog
-from torque_safety_controller.driving.trajectory import JointMotion, Motion, TrajectoryMotion
+from torque_safety_controller.driving.trajectory import (
+    JointMotion,
+    Motion,
+    TrajectoryMotion,
+    TrajectoryPassed,
+)
 from torque_safety_controller.node.goal_messages import (
     GoalRefused,
     check_frame,
+    check_stamp,
     joint_trajectory_from_message,
     numbers_of,
     pose_from_message,
@@ -47,14 +52,28 @@ from viability_bounds_pkg.state import State, whole_turns
 
 Array = NDArray[np.float64]
 
+WAITING_MAX = 1000
+"""So many goals may wait for their time."""
+
+
+class _Waiting(NamedTuple):
+    """A goal that waits for its time."""
+
+    stamp: int
+    """ns."""
+    topic: Topic
+    apply: Callable[[], None]
+    """May raise `GoalRefused` or `TrajectoryPassed`."""
+
 
 class GoalSubscriber:
     """Subscribes to the topics of goals, ``target_*`` and ``jog_*``; what came last counts.
 
     Goals wait until they are due: a stamp of zero, or one that has passed, takes effect with the
     next control step; one ahead takes effect with the first state at or after it, which makes a
-    plan of goals repeatable. Jogs with a stamp that differs from that of the newest joint state by
-    more than `TIMEOUT` are refused: they are late, or of another clock. Where several nodes
+    plan of goals repeatable. One that is further ahead than `goal_ahead_max` is refused: it is of
+    another clock. So are jogs with a stamp that differs from that of the newest joint state by
+    more than `TIMEOUT`, and trajectories that have passed. Where several nodes
     publish one of these topics, what comes on it is refused, and the arm is to hold until there
     is one.
 
@@ -83,7 +102,7 @@ class GoalSubscriber:
         self._states, self._held = states, controller.goals.held
         self.refused: Counter[str] = Counter()
         self.motion: Motion | None = None
-        self._pending: list[tuple[int, Callable[[], None]]] = []
+        self._waiting: list[_Waiting] = []
         self._contested: set[str] = set()
         self.listen(TARGET_POSE, self._on_pose)
         if len(config.end_effectors) > 1:
@@ -95,7 +114,14 @@ class GoalSubscriber:
         self.listen(JOG_JOINTS, self._on_joint_jog)
 
     def __len__(self) -> int:
-        return len(self._pending)
+        return len(self._waiting)
+
+    @property
+    def due(self) -> str:
+        """Which goal is the next that waits for its time, and how long; empty if there is none."""
+        if not self._waiting or (left := self._waiting[0].stamp - self._states.stamp) <= 0:
+            return ""
+        return f"{self._waiting[0].topic.name} due in {1e-9 * left:.1f} s"
 
     @property
     def trouble(self) -> str:
@@ -128,15 +154,19 @@ class GoalSubscriber:
 
         topic.subscription(self._node, receive, partial(self.refuse, topic))
 
-    def refuse(self, topic: Topic, reason: GoalRefused | str) -> None:
+    def refuse(self, topic: Topic, reason: Exception | str) -> None:
         """Count and log a goal that cannot be followed, or a publisher that cannot be heard."""
         self.refused[topic.name] += 1
         self._node.get_logger().warning(f"{topic.name} refused: {reason}")
 
-    def add(self, message: Any, apply: Callable[[], None]) -> None:
-        """Call `apply` when the time in the header of `message` has come."""
-        self._pending.append((stamp_to_ns(message.header.stamp), apply))
-        self._pending.sort(key=lambda entry: entry[0])
+    def add(self, topic: Topic, message: Any, apply: Callable[[], None]) -> None:
+        """Call `apply` when the time in the header of `message` has come; see `_Waiting`."""
+        stamp = stamp_to_ns(message.header.stamp)
+        check_stamp(stamp, self._states.stamp, self._config.goal_ahead_max)
+        if len(self._waiting) >= WAITING_MAX:
+            raise GoalRefused(f"{WAITING_MAX} goals wait for their time already")
+        self._waiting.append(_Waiting(stamp, topic, apply))
+        self._waiting.sort(key=lambda goal: goal.stamp)
 
     def apply_due(self, stamp: int, state: State) -> bool:
         """Apply the goals that are due at `stamp`, ns, and advance a motion.
@@ -152,9 +182,14 @@ class GoalSubscriber:
         """
         if self._held != self._controller.goals.held:
             self._held, self.motion = self._controller.goals.held, None
-        due = False
-        while self._pending and self._pending[0][0] <= stamp:
-            self._pending.pop(0)[1]()
+        due, waiting, ahead = False, self._waiting, self._config.goal_ahead_max
+        # It came before the first state, or the robot's time has begun anew.
+        while waiting and 1e-9 * (waiting[-1].stamp - stamp) > ahead:
+            goal = waiting.pop()
+            self._try(goal.topic, partial(check_stamp, goal.stamp, stamp, ahead))
+        while waiting and waiting[0].stamp <= stamp:
+            goal = waiting.pop(0)
+            self._try(goal.topic, goal.apply)
             due = True
         if self.motion is None:
             return due
@@ -162,7 +197,15 @@ class GoalSubscriber:
             self.motion = None
         return True
 
-    def _move(self, motion: Motion) -> None:
+    def _try(self, topic: Topic, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except (GoalRefused, TrajectoryPassed) as error:
+            self.refuse(topic, error)
+
+    def _move(self, motion: JointMotion | TrajectoryMotion) -> None:
+        states = self._states
+        motion.check_late(self._controller, State(states.q, states.v), states.stamp)
         self.motion = motion
 
     # Goals at rest
@@ -174,11 +217,12 @@ class GoalSubscriber:
             self.motion = None
             self._controller.goals.set_pose(pose)
 
-        self.add(message, apply)
+        self.add(TARGET_POSE, message, apply)
 
     def _on_second_pose(self, message: PoseStamped) -> None:
         pose = self._base * pose_from_message(message, self._config.base_frame)
-        self.add(message, lambda: self._controller.goals.set_other_pose(0, pose))
+        goals = self._controller.goals
+        self.add(TARGET_POSE_SECOND, message, lambda: goals.set_other_pose(0, pose))
 
     def _on_posture(self, message: JointState) -> None:
         q_des = posture_from_message(message, self._config)
@@ -189,20 +233,20 @@ class GoalSubscriber:
             turns = whole_turns(q_des, self._states.q, self._config.continuous)
             self._controller.goals.set_posture(q_des + turns)
 
-        self.add(message, apply)
+        self.add(TARGET_POSTURE, message, apply)
 
     # Goals that move
 
     def _on_trajectory(self, message: MultiDOFJointTrajectory) -> None:
         frames = self._config.base_frame, self._config.end_effectors[0]
         trajectory = trajectory_from_message(message, *frames, self._base)
-        begin = stamp_to_ns(message.header.stamp)
-        self.add(message, lambda: self._move(TrajectoryMotion(trajectory, begin)))
+        motion = TrajectoryMotion(trajectory, stamp_to_ns(message.header.stamp))
+        self.add(TARGET_TRAJECTORY, message, lambda: self._move(motion))
 
     def _on_joint_trajectory(self, message: JointTrajectory) -> None:
-        config = self._config
+        config, topic = self._config, TARGET_JOINT_TRAJECTORY
         if not message.points:  # as controllers of trajectories take it: stop
-            self.add(message, lambda: self._jog_joints(np.zeros(len(config.joints))))
+            self.add(topic, message, lambda: self._jog_joints(np.zeros(len(config.joints))))
             return
         trajectory = joint_trajectory_from_message(message, config)
         excess = trajectory.fastest() / config.velocity_max
@@ -214,7 +258,7 @@ class GoalSubscriber:
         limits = config.position_min, config.position_max, config.velocity_max
         begin = stamp_to_ns(message.header.stamp)
         motion = JointMotion(trajectory, begin, *limits, config.continuous)
-        self.add(message, lambda: self._move(motion))
+        self.add(topic, message, lambda: self._move(motion))
 
     def _on_hand_jog(self, message: TwistStamped) -> None:
         hand, frame = self._config.end_effectors[0], message.header.frame_id
@@ -222,7 +266,7 @@ class GoalSubscriber:
         twist = numbers_of(message.twist.linear, message.twist.angular)
         if not np.isfinite(twist).all():
             raise GoalRefused("twist is not finite")
-        self._check_stamp(message.header)
+        self._check_jog(message)
         in_hand = frame == hand
         if not in_hand:
             twist = (twist.reshape(2, 3) @ self._base.rotation.T).ravel()
@@ -235,12 +279,12 @@ class GoalSubscriber:
                 self.motion = motion
             motion.command_twist(twist, in_hand)
 
-        self.add(message, jog)
+        self.add(JOG_HAND, message, jog)
 
     def _on_joint_jog(self, message: JointState) -> None:
         velocities = velocities_from_message(message, self._config.joints)
-        self._check_stamp(message.header)
-        self.add(message, lambda: self._jog_joints(velocities))
+        self._check_jog(message)
+        self.add(JOG_JOINTS, message, lambda: self._jog_joints(velocities))
 
     def _jog_joints(self, velocities: Array) -> None:
         config, motion = self._config, self.motion
@@ -249,12 +293,5 @@ class GoalSubscriber:
             self.motion = motion
         motion.command(velocities)
 
-    def _check_stamp(self, header: Header) -> None:
-        stamp, now = stamp_to_ns(header.stamp), self._states.stamp
-        apart = 1e-9 * (stamp - now)
-        if stamp and now >= 0 and abs(apart) > TIMEOUT:
-            when = "ahead of" if apart > 0 else "before"
-            raise GoalRefused(
-                f"header.stamp is {abs(apart):.3g} s {when} that of the joint states; allowed: "
-                f"{TIMEOUT:g} s, or 0"
-            )
+    def _check_jog(self, message: TwistStamped | JointState) -> None:
+        check_stamp(stamp_to_ns(message.header.stamp), self._states.stamp, TIMEOUT, TIMEOUT)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from std_msgs.msg import String
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.modes import Mode
+from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.periodic import StateStream
 from torque_safety_controller.node.topics import CONTROLLER_MODE, HAND_POSE
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
@@ -62,7 +63,7 @@ class ControllerReport:
         supervisor: has mode, reason and share.
         states: as they come.
         refused: what was refused, by kind and reason.
-        pending: how many goals wait.
+        goals: that wait for their time.
     """
 
     def __init__(
@@ -73,10 +74,10 @@ class ControllerReport:
         supervisor: Supervisor,
         states: StateStream,
         refused: Mapping[str, Counter[str]],
-        pending: Callable[[], int],
+        goals: GoalSubscriber,
     ) -> None:
         self._controller, self._supervisor, self._states = controller, supervisor, states
-        self._refused, self._pending = refused, pending
+        self._refused, self._goals = refused, goals
         self._fixed = {
             "integral_action": config.integral.integral_action,
             "torque_rate_max": "clipped" if config.clips_torque_rates else "none",
@@ -111,6 +112,8 @@ class ControllerReport:
         supervisor, controller = self._supervisor, self._controller
         mode = supervisor.mode
         level, text = LEVELS[mode], f"{mode.value}: {supervisor.reason}"
+        if due := self._goals.due:
+            text = f"{text}; {due}"
         troubles = supervisor.trouble, *(part.trouble for part in controller.parts)
         for trouble in filter(None, troubles):
             level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
@@ -128,7 +131,7 @@ class ControllerReport:
             "bounds_last_relaxation_rad_s2": self._last_relaxation,
             "latency_p50_us": 1e6 * self._latencies.percentile(50),
             "latency_p99_us": 1e6 * self._latencies.percentile(99),
-            "goals_pending": self._pending(),
+            "goals_pending": len(self._goals),
         }
         for more in (self._fixed, self._refused, self._supervisor.values()):
             values |= more

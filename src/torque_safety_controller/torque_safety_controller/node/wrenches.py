@@ -89,12 +89,12 @@ class WrenchSubscriber:
         frame = message.header.frame_id
         check_frame(frame, config.end_effectors[0], config.base_frame)
         rotation = self._base.rotation if frame == config.base_frame else None
-        self._goals.add(message, lambda: self._apply(interaction, wrench, rotation))
+        apply = partial(self._apply, interaction, wrench, rotation)
+        self._goals.add(TARGET_WRENCH, message, apply)
 
     def _apply(self, interaction: Interaction, wrench: Array, rotation: Array | None) -> None:
         if not interaction.settings.force_directions.any():
-            self._goals.refuse(TARGET_WRENCH, "no direction of 'force_directions' is set")
-            return
+            raise GoalRefused("no direction of 'force_directions' is set")
         interaction.set_target(wrench, rotation)
 
     def _on_tare(

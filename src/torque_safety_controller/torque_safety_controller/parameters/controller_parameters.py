@@ -47,6 +47,9 @@ from viability_bounds_pkg.robot.configuration import (
 
 Array = NDArray[np.float64]
 
+GOAL_AHEAD_MAX = 60.0
+"""Default of how far ahead a goal may be sent, s: scenarios are sent whole."""
+
 INTEGRAL_BUDGET = 0.1
 """Default budget in torque limits: the paper's tau_m."""
 
@@ -228,6 +231,10 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     state_timeout: float = timeout(
         "time without a usable state after which the controller starts anew, s",
         default=0.5,
+    )
+    goal_ahead_max: float = timeout(
+        "how far ahead of the joint states a goal's stamp may be, s; beyond it is refused",
+        default=GOAL_AHEAD_MAX,
     )
     effort_tolerance: float = number(
         "allowed difference of reported and commanded torques, share of torque_max; beyond it "

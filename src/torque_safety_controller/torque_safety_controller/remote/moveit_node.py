@@ -25,11 +25,17 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from torque_safety_controller.node.goal_messages import GoalRefused, joint_trajectory_from_message
+from torque_safety_controller.driving.trajectory import TrajectoryPassed
+from torque_safety_controller.node.goal_messages import (
+    GoalRefused,
+    check_stamp,
+    joint_trajectory_from_message,
+)
 from torque_safety_controller.node.topics import (
     CONTROLLER_MODE,
     TARGET_JOINT_TRAJECTORY,
 )
+from torque_safety_controller.parameters.controller_parameters import GOAL_AHEAD_MAX
 from torque_safety_controller.remote.execution import Execution, Progress, Tolerances
 from torque_safety_controller.remote.moveit_parameters import MoveitConfiguration
 from viability_bounds_pkg.ros.arm_node import ArmNode
@@ -225,13 +231,13 @@ class MoveitNode(ArmNode):
             raise Refused(f"goal_time_tolerance is {patience:g} s; allowed: 0 or more")
         patience = patience or config.trajectory_goal_time
         begin = stamp_to_ns(message.header.stamp)
-        if begin and begin + round(1e9 * trajectory.duration) < self._reader.stamp:
-            late = 1e-9 * (self._reader.stamp - begin)
-            raise Refused(
-                f"header.stamp is {late:.3g} s before that of the joint states: the trajectory "
-                "has passed",
-                Result.OLD_HEADER_TIMESTAMP,
-            )
+        check_stamp(begin, self._reader.stamp, GOAL_AHEAD_MAX)
+        if begin:
+            try:
+                late = 1e-9 * (self._reader.stamp - begin)
+                trajectory.check_late(late, self._state(), config.continuous)
+            except TrajectoryPassed as error:
+                raise Refused(str(error), Result.OLD_HEADER_TIMESTAMP) from error
         return Execution(joints, trajectory, path, end, patience, begin, config.continuous)
 
     async def _answer(self, handle: ServerGoalHandle) -> Any:
