@@ -220,6 +220,21 @@ def test_a_goal_that_waits_is_told_and_one_of_another_clock_is_refused(ros, monk
     assert "; target_pose due in 1.5 s" in chain.reported("message")
 
 
+def test_goals_that_no_task_serves_get_one_warning(ros, capfd):
+    chain = NodeChain(ros, posture_kp=0.0)
+    for stamp in (10, 20):
+        chain.postures.publish(joint_state(JOINTS, 0, GOAL_Q))
+        chain.await_goals()
+        chain.answer(stamp)
+    told = "target_posture: posture_kp is 0: no task brings the arm to the goal"
+    assert capfd.readouterr().err.count(told) == 1
+    ros.accepts("controller_node", posture_kp=1.0)
+    chain.postures.publish(joint_state(JOINTS, 0, GOAL_Q))
+    chain.await_goals()
+    chain.answer(30)
+    assert told not in capfd.readouterr().err
+
+
 # Torques
 
 

@@ -55,6 +55,15 @@ Array = NDArray[np.float64]
 WAITING_MAX = 1000
 """So many goals may wait for their time."""
 
+NEEDED = {
+    TARGET_POSE.name: ("pose_weight", "pose_kp"),
+    TARGET_POSE_SECOND.name: ("pose_weight", "pose_kp"),
+    TARGET_TRAJECTORY.name: ("pose_weight", "pose_kp"),
+    TARGET_POSTURE.name: ("posture_kp",),
+    TARGET_JOINT_TRAJECTORY.name: ("posture_kp",),
+}
+"""Gains that are not to be 0 where goals of a topic are to be reached."""
+
 
 class _Waiting(NamedTuple):
     """A goal that waits for its time."""
@@ -104,6 +113,7 @@ class GoalSubscriber:
         self.motion: Motion | None = None
         self._waiting: list[_Waiting] = []
         self._contested: set[str] = set()
+        self._unserved: set[str] = set()
         self.listen(TARGET_POSE, self._on_pose)
         if len(config.end_effectors) > 1:
             self.listen(TARGET_POSE_SECOND, self._on_second_pose)
@@ -190,6 +200,7 @@ class GoalSubscriber:
         while waiting and waiting[0].stamp <= stamp:
             goal = waiting.pop(0)
             self._try(goal.topic, goal.apply)
+            self._warn_unserved(goal.topic.name)
             due = True
         if self.motion is None:
             return due
@@ -202,6 +213,16 @@ class GoalSubscriber:
             act()
         except (GoalRefused, TrajectoryPassed) as error:
             self.refuse(topic, error)
+
+    def _warn_unserved(self, topic: str) -> None:
+        """Warn of the first of the goals that no task brings the arm to."""
+        gains = self._controller.goals.gains
+        off = [name for name in NEEDED.get(topic, ()) if not getattr(gains, name)]
+        if off and topic not in self._unserved:
+            self._node.get_logger().warning(
+                f"{topic}: {off[0]} is 0: no task brings the arm to the goal"
+            )
+        (self._unserved.add if off else self._unserved.discard)(topic)
 
     def _move(self, motion: JointMotion | TrajectoryMotion) -> None:
         states = self._states
