@@ -141,6 +141,19 @@ def test_targets_that_cannot_be_exerted_are_refused_and_others_are_exerted(ros):
     ros.wait_until(lambda: missing() < 0.05, "the torques of the target")  # N m
 
 
+def test_a_target_ends_when_its_publisher_has_gone(ros, capfd):
+    hand = WrenchChain(ros, yield_threshold=[])
+    hand.feels = NOTHING
+    hand.give_pose()
+    hand.targets.publish(wrench_message("panda_hand", (0.0, 0.0, 10.0)))
+    hand.until("compliance", "force")
+    ros.probe.destroy_publisher(hand.targets)
+    hand.until("compliance", "off")
+    assert "target_wrench ends: its publisher has gone" in capfd.readouterr().err
+    assert hand.reported("mode") == "TRACKING"
+    assert float(hand.reported("position_error_m")) < 1e-6  # it holds its place
+
+
 def test_after_the_strongest_wrenches_that_are_taken_the_arm_goes_on(ros):
     """Sums, squares and filters of larger ones would not be finite for ever."""
     hand = WrenchChain(ros)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -23,13 +24,19 @@ from torque_safety_controller.parts.contact.wrench_sensor import (
     WrenchSensor,
 )
 from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.runtime import steady_timer
 from viability_bounds_pkg.ros.topics import FT_WRENCH
 
 Array = NDArray[np.float64]
 
+_PERIOD = 0.5
+"""Between two looks for the publisher of a target, s."""
+
 
 class WrenchSubscriber:
     """Subscribes to ``ft_wrench`` and ``target_wrench``; serves ``~/tare_ft_sensor``.
+
+    A target ends when nobody publishes ``target_wrench`` any more.
 
     Args:
         node: listens and logs what is refused.
@@ -60,6 +67,8 @@ class WrenchSubscriber:
             return
         sensor = interaction.sensor
         node.listen(FT_WRENCH, partial(self._on_measured, sensor))
+        count = partial(node.count_publishers, TARGET_WRENCH.name)
+        steady_timer(node, _PERIOD, partial(self._watch, interaction, count))
         TARE_FT_SENSOR.serve(node, partial(self._on_tare, interaction, sensor))
 
     def _on_measured(self, sensor: WrenchSensor, message: WrenchStamped) -> None:
@@ -96,6 +105,12 @@ class WrenchSubscriber:
         if not interaction.settings.force_directions.any():
             raise GoalRefused("no direction of 'force_directions' is set")
         interaction.set_target(wrench, rotation)
+
+    def _watch(self, interaction: Interaction, count: Callable[[], int]) -> None:
+        """End a wrench whose publisher has gone."""
+        if interaction.has_target and not count():
+            interaction.end_target()
+            self._logger.warning("target_wrench ends: its publisher has gone")
 
     def _on_tare(
         self,

@@ -142,6 +142,15 @@ class Interaction(Part):
         """
         self._target = (-np.asarray(wrench, dtype=float), rotation)
 
+    @property
+    def has_target(self) -> bool:
+        """Whether a wrench is to be exerted."""
+        return self._target is not None
+
+    def end_target(self) -> None:
+        """Exert no wrench any more; the hand stays where it is."""
+        self._target = None
+
     def configure(self, settings: Settings) -> None:
         """See `Part.configure`."""
         self.settings = settings.interaction
