@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes as programs: what a signal does at any moment, and that one started again is heard."""
 
+import re
 import signal
 import subprocess
 import sys
@@ -131,6 +132,20 @@ def test_a_program_that_was_killed_and_started_again_is_heard_and_obeyed(ros):
                 )
             finally:
                 program.kill()
+
+
+def test_a_killed_program_counts_for_a_second_and_tells_of_itself_often_enough_else():
+    text = Path(runtime.__file__).with_name("fastdds.xml").read_text()
+    lease, told = (
+        sum(
+            int(part) * unit
+            for part, unit in zip(re.findall(r">(\d+)<", row), (1.0, 1e-9), strict=False)
+        )
+        for name in ("leaseDuration", "leaseAnnouncement")
+        for row in re.findall(f"<{name}>.*</{name}>", text)
+    )
+    assert lease <= 1.0
+    assert told <= lease / 4
 
 
 def test_settings_of_fast_dds_that_users_have_are_kept(tmp_path, monkeypatch):
