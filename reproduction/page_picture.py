@@ -31,7 +31,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("robot", nargs="?", default="panda")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images" / "page.png")
-    parser.add_argument("--after", type=float, default=1.5, help="s after Enter (default: 1.5)")
+    parser.add_argument("--after", type=float, default=3.2, help="s after Enter (default: 3.2)")
     options = parser.parse_args()
     if find_browser() is None:
         print("error: there is no browser: apt install chromium", file=sys.stderr)
