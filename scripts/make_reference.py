@@ -120,7 +120,9 @@ yours; `scenario_node` and `viewer_node` count as such.
 
 ## Control streams
 
-Best effort with depth 1: the newest message wins. The stamp of a joint state names the control
+Published reliably, so that every tool hears them, and subscribed to with best effort; depth 1: the
+newest message wins. A reliable subscriber is work for the publisher: on slow networks take
+`slow/joint_states`. The stamp of a joint state names the control
 step; estimates, limits and commands carry the stamp of the state that they answer.
 
 """

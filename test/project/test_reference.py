@@ -82,7 +82,8 @@ def test_a_node_has_the_topics_services_and_parameters_of_the_tables(node):
             assert set(listed) - set(found) <= SOMETIMES
         assert set(found) - set(listed) <= OF_ROS
         for topic in set(found) & set(listed):
-            message, wanted = listed[topic].message, listed[topic].qos
+            message = listed[topic].message
+            wanted = listed[topic].offered if end == "source" else listed[topic].qos
             kind = f"{message.__module__.split('.')[0]}/msg/{message.__name__}"
             assert found[topic] == [kind]
             for profile in (i.qos_profile for i in infos(topic) if i.node_name == name):

@@ -12,7 +12,7 @@ from trajectory_msgs.msg import JointTrajectory
 from viability_bounds_pkg.baselines import naive_bounds
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.ros.runtime import SLOW_QOS, STATUS_QOS
+from viability_bounds_pkg.ros.runtime import NEWEST_QOS, STATUS_QOS
 from viability_bounds_pkg.testing.ros_harness import joint_state
 from viability_bounds_pkg.viability import BoundsSolver
 
@@ -105,8 +105,8 @@ def test_answers_are_the_exact_bounds_with_the_stamp_of_the_state(ros):
 def test_distances_to_limits_are_shown_by_joint_until_the_robot_is_silent(ros):
     robot = BoundsProbe(ros, torque_max=[10.0, 20.0, 30.0])
     shown = ros.listen(JointState, "limit_distances", STATUS_QOS)
-    states = ros.listen(JointState, "slow/joint_states", SLOW_QOS)
-    limits = ros.listen(JointTrajectory, "slow/acceleration_limits", SLOW_QOS)
+    states = ros.listen(JointState, "slow/joint_states", NEWEST_QOS)
+    limits = ros.listen(JointTrajectory, "slow/acceleration_limits", NEWEST_QOS)
 
     def show(stamp, tau):
         state = joint_state(JOINTS, stamp, [0.9, -0.6, 50.0], [0.5, -2.5, 0.0], tau)

@@ -5,7 +5,7 @@ import pytest
 from sensor_msgs.msg import JointState
 
 from viability_bounds_pkg.ros.arm_node import ArmNode, connect
-from viability_bounds_pkg.ros.runtime import stamp_to_ns
+from viability_bounds_pkg.ros.runtime import STATUS_QOS, stamp_to_ns
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES
 from viability_bounds_pkg.testing.ros_harness import RosHarness, joint_state
 
@@ -62,6 +62,12 @@ def others(ros):
     harness = RosHarness(ros.domain)
     yield harness
     harness.close()
+
+
+def test_reliable_subscribers_as_those_of_moveit_hear_a_stream(ros):
+    robot = Part(ros, "robot", JOINT_STATES)
+    heard = ros.listen(JointState, "joint_states", STATUS_QOS)
+    ros.wait_until(lambda: heard, each=lambda: robot.states.publish(state(1)))
 
 
 def test_all_get_the_same_object_once_and_others_get_it_too(ros):

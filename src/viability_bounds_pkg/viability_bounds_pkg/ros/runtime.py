@@ -28,8 +28,9 @@ GOAL_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 STATUS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 """What tools show: also heard where a subscription is reliable, as those of RViz are."""
 
-SLOW_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-"""Copies of streams for who looks on: the newest is enough."""
+NEWEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+"""Streams as they are published, and their slow copies: the newest is enough, a publisher never
+waits, and whoever subscribes reliably hears them, too."""
 
 LATCHED_QOS = QoSProfile(
     depth=1,

@@ -35,7 +35,7 @@ class Stream:
         events = PublisherEventCallbacks(matched=self._on_matched)
         self.subscribers = 0
         self._publisher = node.create_publisher(
-            topic.message, topic.name, topic.qos, event_callbacks=events
+            topic.message, topic.name, topic.offered, event_callbacks=events
         )
         self.topic_name: str = self._publisher.topic_name
         self.listeners: list[Listener] = []

@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS, SLOW_QOS, STATUS_QOS
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS, NEWEST_QOS, STATUS_QOS
 
 USER = "user"
 """Stands for nodes of others."""
@@ -35,7 +35,7 @@ class Topic:
     Attributes:
         name: as the nodes use it.
         message: its type.
-        qos: that this project's nodes publish and subscribe with.
+        qos: that this project's nodes subscribe with.
         source: nodes that publish it.
         sink: nodes that subscribe to it.
         meaning: of its messages, with units.
@@ -48,9 +48,14 @@ class Topic:
     sink: tuple[str, ...]
     meaning: str
 
+    @property
+    def offered(self) -> QoSProfile:
+        """Quality of service of publishers: reliable subscribers are to hear streams, too."""
+        return NEWEST_QOS if self.qos is CONTROL_QOS else self.qos
+
     def publisher(self, node: Node, name: str | None = None) -> Publisher:
         """Return a publisher; `name` is for topics that a parameter names."""
-        return node.create_publisher(self.message, name or self.name, self.qos)
+        return node.create_publisher(self.message, name or self.name, self.offered)
 
     def subscription(
         self,
@@ -150,7 +155,7 @@ LIMIT_DISTANCES = Topic(
 SLOW_JOINT_STATES = Topic(
     "slow/joint_states",
     JointState,
-    SLOW_QOS,
+    NEWEST_QOS,
     ("bounds_node",),
     ("viewer_node", "moveit_node", USER),
     "copy of `joint_states`, 20 times a second, for displays and slow networks",
@@ -158,7 +163,7 @@ SLOW_JOINT_STATES = Topic(
 SLOW_ACCELERATION_LIMITS = Topic(
     "slow/acceleration_limits",
     JointTrajectory,
-    SLOW_QOS,
+    NEWEST_QOS,
     ("bounds_node",),
     ("viewer_node", USER),
     "copy of `acceleration_limits`, likewise",
