@@ -175,10 +175,7 @@ def _reduced_arm(
     held = {name: locked.get(name, 0.0) for name in names if name not in joints}
     wanted = [*joints, *held]
     text = tostring(root, encoding="unicode")
-    try:
-        order = kinematic_order(text, wanted)
-    except (ValueError, RuntimeError) as error:
-        raise RobotDescriptionError(f"URDF does not load: {error}") from error
+    order = kinematic_order(text, wanted)
     if [name for name in order if name in joints] != list(joints):
         order = tuple(wanted)  # the model's error says what is wrong with them
     rest = {name: position for name, position in locked.items() if name not in held}

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -16,10 +16,19 @@ from numpy.typing import NDArray
 from viability_bounds_pkg.estimate.worst_case import NO_INERTIA
 from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
 from viability_bounds_pkg.robot.description import build_model, kinematic_order
+from viability_bounds_pkg.robot.mistakes import (
+    MOVING,
+    end_of,
+    inertial_mistakes,
+    inertial_oddities,
+    urdf_mistakes,
+)
 
 Array = NDArray[np.float64]
 
-_MOVING = ("revolute", "continuous", "prismatic")
+
+FASTEST = 100.0
+"""Speed limit, rad/s or m/s, above which it stands for none: no arm's joint is as fast."""
 
 
 class NewRobotError(ArmSafetyError, ValueError):
@@ -40,8 +49,11 @@ class Chain:
         v_max: speed limits, shape (n,), rad/s.
         tau_max: torque limits, shape (n,), N m.
         continuous: whether a joint turns without end, shape (n,).
+        slides: whether a joint is prismatic, shape (n,): its units are m, m/s and N.
         locked: the movable joints that are none of these.
         model: Pinocchio's, n joints.
+        slowed: whether speed limits are not those of the URDF.
+        odd: what is odd about the links' inertias, a line each.
     """
 
     name: str
@@ -53,51 +65,66 @@ class Chain:
     v_max: Array
     tau_max: Array
     continuous: NDArray[np.bool_]
+    slides: NDArray[np.bool_]
     locked: tuple[str, ...]
     model: pin.Model
+    slowed: bool
+    odd: tuple[str, ...]
+
+    def remarks(self) -> list[str]:
+        """Return what looks as if the URDF did not have it from a data sheet, a line each."""
+        lines = list(self.odd)
+        if len(self.joints) > 2 and len(set(self.tau_max.tolist())) == 1:
+            lines.append(
+                f"the effort limits are {self.tau_max[0]:g} everywhere: if this is a placeholder, "
+                "write those of the motors into the URDF"
+            )
+        return lines
+
+    def units(self, joint: int) -> tuple[str, str]:
+        """Return the units of a joint's position and of its torque, or force."""
+        return ("m", "N") if self.slides[joint] else ("rad", "N m")
 
 
-def find_chain(urdf: str, tips: Sequence[str], base: str = "") -> Chain:
+def find_chain(
+    urdf: str, tips: Sequence[str], base: str = "", velocity_max: float = math.inf
+) -> Chain:
     """Return the chain of moving joints from `base` to `tips`.
 
     Args:
         urdf: text of a URDF that is well-formed.
         tips: links at the ends of one or several arms.
         base: joints before this link are locked; none if empty.
+        velocity_max: largest speed limit, in place of larger ones or of none, rad/s or m/s.
 
     Raises:
-        NewRobotError: an unknown link, a closed loop, a joint that mimics or that others mimic, a
-            planar or floating one, one without limits, or that moves no inertia.
+        NewRobotError: what is wrong, all of it, a line each: with the URDF, such as a closed
+            loop; an unknown link; a joint that mimics or that others mimic, a planar or floating
+            one, one without limits; a link that moves without an inertia.
         RobotDescriptionError: the URDF does not load.
     """
     root = ElementTree.fromstring(urdf)
-    above = _joints_above(root)
-    links = [each.get("name", "") for each in root.findall("link")]
-    for link in (*tips, *filter(None, [base])):
-        if link not in links:
-            parents = {_link(joint, "parent") for joint in root.findall("joint")}
-            ends = ", ".join(link for link in links if link not in parents)
-            hint = did_you_mean(link, links) or f"; links at the ends: {ends}"
-            raise NewRobotError(f"the URDF has no link '{link}'{hint}")
-    moving: dict[str, Element] = {}
-    for tip in tips:
-        way = _way(above, tip, base)
-        _check_kinds(root, way)
-        moving |= {name: each for name, each in way.items() if each.get("type") in _MOVING}
-    if not moving:
-        raise NewRobotError(
-            f"no joint moves between '{base or 'the root'}' and {', '.join(tips)}; the tip must "
-            "be a link behind the arm's last joint"
-        )
-    limits = np.array([_limits(name, each) for name, each in moving.items()]).T
+    wrong = urdf_mistakes(root)
+    try:
+        ways = _ways(root, tips, base)
+    except NewRobotError as error:
+        raise NewRobotError("\n".join(wrong or [str(error)])) from None
+    kinds = [line for way in ways for line in _of_kinds(root, way)]
+    moving = {
+        name: each for way in ways for name, each in way.items() if each.get("type") in MOVING
+    }
+    limits, lacking = _limits(moving, velocity_max)
+    wrong += kinds[:1] or lacking + inertial_mistakes(root, moving)
+    if wrong:
+        raise NewRobotError("\n".join(wrong))
     order = kinematic_order(urdf, tuple(moving))
-    q_min, q_max, v_max, tau_max = limits[:, [list(moving).index(name) for name in order]]
+    q_min, q_max, v_max, tau_max = np.array([limits[name] for name in order]).T
     model = build_model(urdf, order)
     _check_inertias(model)
-    others = (each for each in root.findall("joint") if each.get("type") in _MOVING)
+    others = (each for each in root.findall("joint") if each.get("type") in MOVING)
     return Chain(
         name=_file_name(root.get("name", "robot")),
-        root=next(link for link in links if link not in above),
+        root=_root(root),
         tips=tuple(tips),
         joints=order,
         q_min=q_min,
@@ -105,42 +132,50 @@ def find_chain(urdf: str, tips: Sequence[str], base: str = "") -> Chain:
         v_max=v_max,
         tau_max=tau_max,
         continuous=np.isinf(q_max),
+        slides=np.array([moving[name].get("type") == "prismatic" for name in order]),
         locked=tuple(name for each in others if (name := each.get("name", "")) not in moving),
         model=model,
+        slowed=velocity_max < math.inf,
+        odd=tuple(inertial_oddities(root, moving)),
     )
 
 
-def _link(joint: Element, end: str) -> str:
-    element = joint.find(end)
-    return "" if element is None else element.get("link", "")
+def _root(root: Element) -> str:
+    """Return the link that all others hang on."""
+    carried = {end_of(joint, "child") for joint in root.findall("joint")}
+    return next(name for name in _links(root) if name not in carried)
 
 
-def _joints_above(root: Element) -> dict[str, Element]:
-    """Return the joint that carries each link; there may be one only."""
-    above: dict[str, Element] = {}
-    for joint in root.findall("joint"):
-        child = _link(joint, "child")
-        if child in above:
-            names = f"'{above[child].get('name')}' and '{joint.get('name')}'"
-            raise NewRobotError(
-                f"link '{child}' hangs on {names}: a closed loop, whose motion a tree of joints "
-                "does not have; cut it in the URDF where it carries least"
-            )
-        above[child] = joint
-    return above
+def _links(root: Element) -> list[str]:
+    return [each.get("name", "") for each in root.findall("link")]
+
+
+def _ways(root: Element, tips: Sequence[str], base: str) -> list[dict[str, Element]]:
+    """Return the joints from `base` to each tip by name, at least one of which moves."""
+    links, joints = _links(root), root.findall("joint")
+    for link in (*tips, *filter(None, [base])):
+        if link not in links:
+            parents = {end_of(joint, "parent") for joint in joints}
+            ends = ", ".join(link for link in links if link not in parents)
+            hint = did_you_mean(link, links) or f"; links at the ends: {ends}"
+            raise NewRobotError(f"the URDF has no link '{link}'{hint}")
+    above = {end_of(joint, "child"): joint for joint in joints}
+    ways = [_way(above, tip, base) for tip in tips]
+    if not any(each.get("type") not in (None, "fixed") for way in ways for each in way.values()):
+        raise NewRobotError(
+            f"no joint moves between '{base or 'the root'}' and {', '.join(tips)}; the tip must "
+            "be a link behind the arm's last joint"
+        )
+    return ways
 
 
 def _way(above: Mapping[str, Element], tip: str, base: str) -> dict[str, Element]:
     """Return the joints from `base` to `tip` by name."""
     way: list[Element] = []
     link = tip
-    while link in above and link != base:
-        if len(way) > len(above):
-            raise NewRobotError(
-                f"the joints above '{tip}' go round in a circle; cut it in the URDF"
-            )
+    while link in above and link != base and above[link] not in way:
         way.append(above[link])
-        link = _link(above[link], "parent")
+        link = end_of(above[link], "parent")
     if base and link != base:
         raise NewRobotError(
             f"link '{tip}' does not hang on '{base}'; --base must be on the way from "
@@ -149,63 +184,78 @@ def _way(above: Mapping[str, Element], tip: str, base: str) -> dict[str, Element
     return {each.get("name", ""): each for each in reversed(way)}
 
 
-def _check_kinds(root: Element, way: Mapping[str, Element]) -> None:
-    """Refuse joints without a motor of their own, and grippers."""
+def _of_kinds(root: Element, way: Mapping[str, Element]) -> Iterator[str]:
+    """Yield what is wrong with joints without a motor of their own, and grippers, tip first."""
+    joints = root.findall("joint")
     followers = {
         mimic.get("joint", ""): joint.get("name", "")
-        for joint in root.findall("joint")
+        for joint in joints
         if (mimic := joint.find("mimic")) is not None
     }
-    moving = [name for name, joint in way.items() if joint.get("type") in _MOVING]
+    moving = [name for name, joint in way.items() if joint.get("type") in MOVING]
     for name, joint in reversed(list(way.items())):
-        kind = joint.get("type")
+        kind, parent = joint.get("type"), end_of(joint, "parent")
+        fingers = [
+            each.get("name", "")
+            for each in joints
+            if each.get("type") == "prismatic" and end_of(each, "parent") == parent
+        ]
         if kind in ("floating", "planar"):
-            raise NewRobotError(
-                f"joint '{name}' is {kind}, which no motor moves; --base {_link(joint, 'child')} "
+            yield (
+                f"joint '{name}' is {kind}, which no motor moves; --base {end_of(joint, 'child')} "
                 "leaves it out"
             )
-        if joint.find("mimic") is not None and kind in _MOVING:
+            continue
+        if joint.find("mimic") is not None and kind in MOVING:
             why = "mimics another"
         elif name in followers:
             why = f"is one that '{followers[name]}' mimics"
-        elif kind == "prismatic" and len(moving) > 1 and name == moving[-1]:
-            why = "is the last and slides"
+        elif [name] == moving[-1:] and name in fingers and len(fingers) > 1:
+            why = f"is one of the fingers {' and '.join(fingers)}"
         else:
             continue
-        raise NewRobotError(
-            f"joint '{name}' {why}, as in a gripper; end the arm before it, with the tip "
-            f"{_link(joint, 'parent')}"
+        yield (
+            f"joint '{name}' {why}, as in a gripper; end the arm before it, with the tip {parent}"
         )
 
 
-def _limits(name: str, joint: Element) -> tuple[float, float, float, float]:
-    """Return position limits, speed and effort of a joint."""
-    limit = joint.find("limit")
-    given = {} if limit is None else limit.attrib
-    try:
-        values = {
-            key: float(given.get(key, "nan")) for key in ("lower", "upper", "velocity", "effort")
-        }
-    except ValueError as error:
-        raise NewRobotError(
-            f"joint '{name}': {error}, not a number; correct its <limit> in the URDF"
-        ) from None
-    for key, what in (("effort", "torque"), ("velocity", "speed")):
-        if not (math.isfinite(values[key]) and values[key] > 0.0):
-            found = "no" if math.isnan(values[key]) else f"{values[key]:g} as"
-            raise NewRobotError(
-                f"joint '{name}' has {found} {key} limit: nothing is known of its {what}; write "
-                f'{key}="..." into its <limit> in the URDF, from the data sheet'
+def _limits(
+    moving: Mapping[str, Element], velocity_max: float
+) -> tuple[dict[str, list[float]], list[str]]:
+    """Return position limits, speed and effort of joints by name, and what is wrong with them."""
+    limits, wrong = {}, []
+    for name, joint in moving.items():
+        limit = joint.find("limit")
+        given = {} if limit is None else limit.attrib
+        keys = ("lower", "upper", "velocity", "effort")
+        try:
+            low, high, velocity, effort = (float(given.get(key, "nan")) for key in keys)
+        except ValueError as error:
+            wrong.append(f"joint '{name}': {error}, not a number; correct its <limit> in the URDF")
+            continue
+        if velocity_max < math.inf:
+            velocity = min(velocity, velocity_max) if velocity > 0.0 else velocity_max
+        elif FASTEST < velocity < math.inf:
+            wrong.append(
+                f"joint '{name}' has {velocity:g} as velocity limit, which is no limit: give "
+                "--velocity-max, from the data sheet"
             )
-    low, high = values["lower"], values["upper"]
-    if joint.get("type") == "continuous":
-        low, high = -math.inf, math.inf
-    if not low < high:
-        raise NewRobotError(
-            f"joint '{name}' has no room between its position limits, {low:g} and {high:g}; write "
-            'lower="..." and upper="..." into its <limit>, or make it continuous'
-        )
-    return low, high, values["velocity"], values["effort"]
+        for key, what, value in (("effort", "torque", effort), ("velocity", "speed", velocity)):
+            if not (math.isfinite(value) and value > 0.0):
+                found = "no" if math.isnan(value) else f"{value:g} as"
+                wrong.append(
+                    f"joint '{name}' has {found} {key} limit: nothing is known of its {what}; "
+                    f'write {key}="..." into its <limit> in the URDF, from the data sheet'
+                )
+        if joint.get("type") == "continuous":
+            low, high = -math.inf, math.inf
+        if not low < high:
+            wrong.append(
+                f"joint '{name}' has no room between its position limits, {low:g} and {high:g}; "
+                'write lower="..." and upper="..." into its <limit>, or make it continuous'
+            )
+        limits[name] = [low, high, velocity, effort]
+    return limits, wrong
 
 
 def _check_inertias(model: pin.Model) -> None:

@@ -68,7 +68,8 @@ def run_tool(name: str, tool: Callable[[], int]) -> int:
     try:
         return tool()
     except (ArmSafetyError, OSError) as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        for line in str(error).splitlines():  # one for each of several mistakes
+            print(f"{name}: {line}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f"{name}: interrupted, nothing written", file=sys.stderr)

@@ -27,6 +27,7 @@ from viability_bounds_pkg.parameter import (
     texts,
 )
 from viability_bounds_pkg.robot.description import RobotDescriptionError, build_model, read_urdf
+from viability_bounds_pkg.robot.mistakes import inertial_mistakes, inertial_oddities
 
 Array = NDArray[np.float64]
 
@@ -215,6 +216,12 @@ def _urdf_joints(urdf: str, joints: Sequence[str]) -> list[ElementTree.Element]:
     return [elements[name] for name in joints]
 
 
+def units_of(urdf: str, joints: Sequence[str]) -> list[str]:
+    """Return the unit of each joint's position: "m" of slides, "rad" of others."""
+    kinds = [each.get("type") for each in _urdf_joints(urdf, joints)]
+    return ["m" if kind == "prismatic" else "rad" for kind in kinds]
+
+
 def _limit(joint: ElementTree.Element, key: str) -> float | None:
     """Return a limit of a joint of a URDF, None where there is none to use."""
     if joint.get("type") == "continuous" and key in ("lower", "upper"):
@@ -240,7 +247,8 @@ def check_with_urdf(config: RobotConfiguration, urdf: str) -> list[str]:
         SettingError: a joint that the URDF does not have, or angles that must be degrees.
     """
     elements = _urdf_joints(urdf, config.joints)
-    return [line for j, joint in enumerate(elements) for line in _unusual(config, j, joint)]
+    lines = [line for j, joint in enumerate(elements) for line in _unusual(config, j, joint)]
+    return lines + inertial_oddities(ElementTree.fromstring(urdf), config.joints)
 
 
 def _unusual(config: RobotConfiguration, j: int, joint: ElementTree.Element) -> Iterator[str]:
@@ -280,10 +288,15 @@ def load_model(config: RobotConfiguration, urdf: str) -> pin.Model:
         urdf: text of its URDF.
 
     Raises:
-        SettingError: a URDF that does not load, or a joint that it does not have.
+        SettingError: a URDF that does not load, a joint that it does not have, or a moving link
+            without an inertia, or with an impossible one.
     """
+    rotors = dict(zip(config.joints, config.rotor_inertia, strict=False))
     try:
-        return build_model(urdf, config.joints, config.locked, config.rotor_inertia)
+        model = build_model(urdf, config.joints, config.locked, config.rotor_inertia)
+        if wrong := inertial_mistakes(ElementTree.fromstring(urdf), config.joints, rotors):
+            raise RobotDescriptionError("; ".join(wrong))
+        return model
     except RobotDescriptionError as error:
         allowed = {"joints": "joints of the URDF, base to tip", "robot_description": "a URDF"}
         said = f"{allowed.get(error.parameter, 'what fits the URDF')} ({error})"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 import warnings
 from collections import Counter
@@ -22,9 +23,9 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
+from viability_bounds_pkg.robot.mistakes import urdf_mistakes
 
-_OF_NUMBERS = ("mass", "inertia", "origin", "axis")
-"""Elements of a URDF whose attributes are numbers."""
+_OF_JOINT = " (joint)"
 
 
 class RobotDescriptionError(ArmSafetyError, ValueError):
@@ -61,6 +62,8 @@ def package_directories() -> Iterator[Path]:
         yield Path(prefix) / "share"
     for root in filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)):
         yield Path(root)
+        if (Path(root) / "package.xml").is_file():  # it is a package itself
+            yield Path(root).parent
     for entry in sys.path:
         yield Path(entry) / "cmeel.prefix" / "share"
 
@@ -89,6 +92,47 @@ def resolve_uri(uri: str) -> Path:
     return path
 
 
+def package_folder(name: str, beside: Path) -> Path:
+    """Return the folder of a package: that of a file, or one where packages are looked up.
+
+    Raises:
+        RobotDescriptionError: there is none.
+    """
+    if (own := _own_package(beside)) is not None and own[0] == name:
+        return own[1]
+    for directory in package_directories():
+        if (directory / name).is_dir():
+            return directory / name
+    raise RobotDescriptionError(
+        f"no package '{name}' in the folders of ROS_PACKAGE_PATH, nor in AMENT_PREFIX_PATH"
+    )
+
+
+def _own_package(path: Path) -> tuple[str, Path] | None:
+    """Return name and folder of the package that a file lies in; None if it lies in none."""
+    for folder in path.resolve().parents:
+        if (manifest := folder / "package.xml").is_file():
+            try:
+                name = ElementTree.parse(manifest).findtext("name", folder.name)
+            except ElementTree.ParseError:
+                name = folder.name
+            return name.strip(), folder
+    return None
+
+
+def with_own_package(text: str, path: Path) -> str:
+    """Return a URDF with ``package://`` URIs of the package that its file lies in as files.
+
+    A package that is installed keeps them.
+    """
+    if (own := _own_package(path)) is None:
+        return text
+    name, folder = own
+    if any((directory / name).is_dir() for directory in package_directories()):
+        return text
+    return re.sub(rf"package:///*{re.escape(name)}/", lambda _: f"file://{folder}/", text)
+
+
 def _other_file(*paths: Path) -> str:
     """Return a hint at a file beside one that does not exist; empty if none has such a name."""
     beside = [path.parent for path in paths if path.parent.is_dir()]
@@ -98,22 +142,48 @@ def _other_file(*paths: Path) -> str:
 
 
 def read_urdf(uri: str) -> str:
-    """Return the text of the URDF that `uri` names, checked to be well-formed XML.
+    """Return the text of the URDF that `uri` names, checked by `check_urdf`.
 
     Raises:
         RobotDescriptionError: the file is missing, unreadable or is not a URDF.
     """
-    path = resolve_uri(uri)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RobotDescriptionError(f"{uri}: {error}") from error
+    text = urdf_text(resolve_uri(uri), uri)
     check_urdf(text, uri)
     return text
 
 
+def urdf_text(path: Path, source: str) -> str:
+    """Return the text of a URDF file, in UTF-8 or in the encoding that its first line names.
+
+    Names of meshes in its own package are those of files.
+
+    Raises:
+        RobotDescriptionError: it cannot be read; names `source`.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RobotDescriptionError(f"{source}: {error}") from error
+    declared = re.match(rb"""\s*<\?xml[^>]*encoding=["']([\w.-]+)""", data)
+    encoding = declared[1].decode() if declared else "utf-8"
+    for each in ("utf-8", encoding):
+        try:
+            return with_own_package(data.decode(each), path)
+        except (LookupError, UnicodeDecodeError):
+            continue
+    raise RobotDescriptionError(
+        f"{source}: is not in {encoding}, nor in UTF-8; iconv -f ENCODING -t UTF-8 converts it"
+    )
+
+
 def check_urdf(text: str, source: str) -> None:
-    """Raise `RobotDescriptionError`, naming `source`, unless `text` is a URDF."""
+    """Raise `RobotDescriptionError`, naming `source`, unless `text` is a URDF without mistakes."""
+    if found := urdf_mistakes(parsed_urdf(text, source)):
+        raise RobotDescriptionError(f"{source}: {'; '.join(found)}")
+
+
+def parsed_urdf(text: str, source: str) -> ElementTree.Element:
+    """Return the element of the robot; raise `RobotDescriptionError` if there is none."""
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -124,20 +194,7 @@ def check_urdf(text: str, source: str) -> None:
         raise RobotDescriptionError(f"{source}: is for xacro; xacro {source} > robot.urdf")
     if root.find("link") is None:
         raise RobotDescriptionError(f"{source}: there is no <link> in it")
-    # The parser would count an inertia that it cannot read as zero.
-    for element in root.iter():
-        for name, value in element.items() if element.tag in _OF_NUMBERS else ():
-            if not _are_finite(value.split()):
-                raise RobotDescriptionError(
-                    f"{source}: <{element.tag} {name}={value!r}>: no number"
-                )
-
-
-def _are_finite(words: Iterable[str]) -> bool:
-    try:
-        return all(math.isfinite(float(word)) for word in words)
-    except ValueError:
-        return False
+    return root
 
 
 def build_model(
@@ -166,15 +223,12 @@ def build_model(
             differs from the kinematic one, or rotor inertias that cannot be.
     """
     urdf, continuous = _continuous_as_revolute(urdf)
-    try:
-        full = pin.buildModelFromXML(urdf)
-    except (ValueError, RuntimeError) as error:
-        raise RobotDescriptionError(f"URDF does not load: {error}") from error
+    full = _whole_model(urdf)
     for name in joints:
         if not full.existJointName(name):
             raise unknown_name("joint", name, list(full.names)[1:], "joints")
     locked = [i for i in range(1, full.njoints) if full.names[i] not in joints]
-    model = pin.buildReducedModel(full, locked, _posture(full, locked_positions))
+    model, _ = _reduced(full, locked, _posture(full, locked_positions))
     kept = list(model.names)[1:]
     for name, joint in zip(kept, list(model.joints)[1:], strict=True):
         if joint.nq != 1 or joint.nv != 1:
@@ -199,6 +253,49 @@ def build_model(
             )
         model.armature = armature
     return model
+
+
+def _reduced(
+    full: pin.Model,
+    locked: list[int],
+    q: NDArray[np.float64],
+    geometries: Sequence[pin.GeometryModel] = (),
+) -> tuple[pin.Model, list[pin.GeometryModel]]:
+    """Return a model and geometries with joints locked.
+
+    Pinocchio looks for frames of joints by their names alone: meanwhile they get others, as links
+    may have the same. The model that is given keeps them.
+    """
+    joints = [
+        k
+        for k, frame in enumerate(full.frames)
+        if k > 0 and frame.type in (pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT)
+    ]
+    for k in joints:
+        full.frames[k].name += _OF_JOINT
+    for i in range(1, full.njoints):
+        full.names[i] += _OF_JOINT
+    reduced, found = pin.buildReducedModel(full, list(geometries), locked, q)
+    for k, frame in enumerate(reduced.frames):
+        reduced.frames[k].name = frame.name.removesuffix(_OF_JOINT)
+    for i in range(1, reduced.njoints):
+        reduced.names[i] = reduced.names[i].removesuffix(_OF_JOINT)
+    return reduced, list(found)
+
+
+def frame_id(model: pin.Model, name: str) -> int:
+    """Return the index of the frame of a link, or of a joint where no link has its name.
+
+    Links and joints may have the same names.
+
+    Raises:
+        RobotDescriptionError: there is no such frame.
+    """
+    kinds = pin.FrameType
+    for kind in (kinds.BODY, kinds.JOINT, kinds.FIXED_JOINT, kinds.OP_FRAME, kinds.SENSOR):
+        if model.existFrame(name, kind):
+            return int(model.getFrameId(name, kind))
+    raise unknown_name("frame", name, dict.fromkeys(each.name for each in model.frames))
 
 
 def _posture(model: pin.Model, positions: Mapping[str, float] | None) -> NDArray[np.float64]:
@@ -257,10 +354,20 @@ def kinematic_order(urdf: str, joints: Sequence[str]) -> tuple[str, ...]:
     """Return `joints` in the order in which `build_model` wants them, base to tip.
 
     Args:
-        urdf: text of a URDF that loads.
+        urdf: text of the URDF.
         joints: joints that it has, in any order.
+
+    Raises:
+        RobotDescriptionError: the URDF does not load.
     """
-    return tuple(name for name in pin.buildModelFromXML(urdf).names if name in joints)
+    return tuple(name for name in _whole_model(urdf).names if name in joints)
+
+
+def _whole_model(urdf: str) -> pin.Model:
+    try:
+        return pin.buildModelFromXML(urdf)
+    except (ValueError, RuntimeError) as error:
+        raise RobotDescriptionError(f"URDF does not load: {error}") from error
 
 
 def _continuous_as_revolute(urdf: str) -> tuple[str, set[str]]:
@@ -319,7 +426,7 @@ def load_geometry(
         found = Counter(full.frames[item.parentFrame].name for item in geometry.geometryObjects)
         for link in root.iter("link"):
             name, shapes = link.get("name", ""), len(link.findall("collision"))
-            if full.existFrame(name) and found[name] != shapes:
+            if full.existFrame(name, pin.FrameType.BODY) and found[name] != shapes:
                 raise RobotDescriptionError(
                     f"link {name!r}: only {found[name]} of {shapes} collision shapes were "
                     "understood"
@@ -327,7 +434,7 @@ def load_geometry(
     kept = set(model.names)
     locked = [i for i in range(1, full.njoints) if full.names[i] not in kept]
     posture = _posture(full, locked_positions)
-    reduced, (geometry,) = pin.buildReducedModel(full, [geometry], locked, posture)
+    reduced, (geometry,) = _reduced(full, locked, posture, [geometry])
     if list(reduced.names) != list(model.names):
         raise RobotDescriptionError("the model was not made of this URDF")
     return geometry
