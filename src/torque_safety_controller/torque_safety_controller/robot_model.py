@@ -10,7 +10,7 @@ import pinocchio as pin
 from numba import njit
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.robot.description import unknown_name
+from viability_bounds_pkg.robot.description import frame_id
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
@@ -30,10 +30,8 @@ class FrameModel:
     """
 
     def __init__(self, model: pin.Model, frame: str) -> None:
-        if not model.existFrame(frame):
-            raise unknown_name("frame", frame, (each.name for each in model.frames))
+        self._frame_id = frame_id(model, frame)
         self.frame = frame
-        self._frame_id = model.getFrameId(frame)
         self.v: Array = np.zeros(model.nv)
         self.a_last: Array = self.v
         self.pose = pin.SE3.Identity()

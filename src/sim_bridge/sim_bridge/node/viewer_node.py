@@ -38,7 +38,7 @@ from viability_bounds_pkg.robot.configuration import (
     TaskFrames,
     load_model,
 )
-from viability_bounds_pkg.robot.description import RobotDescriptionError
+from viability_bounds_pkg.robot.description import RobotDescriptionError, frame_id
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import JointStateReader, pose_message, wrench_message
 from viability_bounds_pkg.ros.parameters import NodeParameters
@@ -264,8 +264,10 @@ def _make_page(config: ViewerConfiguration, urdf: str) -> Page:
     model = load_model(config, urdf)
     frames = config.base_frame, config.end_effectors[0]
     for name, frame in zip(("base_frame", "end_effector_frame"), frames, strict=True):
-        if not model.existFrame(frame):
-            raise SettingError(name, frame, "a frame of the URDF")
+        try:
+            frame_id(model, frame)
+        except RobotDescriptionError as error:
+            raise SettingError(name, frame, "a frame of the URDF") from error
     try:
         shapes = visual_shapes(urdf, model, config.locked)
     except RobotDescriptionError as error:

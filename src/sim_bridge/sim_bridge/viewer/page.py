@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sim_bridge.viewer.joint_pictures import JointPictures, JointValues, colour, usage
 from sim_bridge.viewer.shapes import VisualShape
 from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.robot.description import frame_id
 
 Array = NDArray[np.float64]
 
@@ -77,7 +78,7 @@ class Page:
         self._limits, self._tau_max = limits, tau_max
         # Of the last picture, whole at any time: the threads of the server read them, too.
         self._base_pose, self._push_origin = pin.SE3.Identity(), np.zeros(3)
-        self._base, self._hand = (model.getFrameId(name) for name in frames)
+        self._base, self._hand = (frame_id(model, name) for name in frames)
         self._requests: SimpleQueue[Request] = SimpleQueue()
         self._pictures = JointPictures(limits.names, limits, tau_max)
         self._driving = self._dragging = self._pushing = self._camera_placed = False
@@ -119,7 +120,7 @@ class Page:
             self._place_camera()
         self._base_pose = self._data.oMf[self._base].copy()
         if self._link.value:
-            link = self._data.oMf[self._model.getFrameId(self._link.value)]
+            link = self._data.oMf[frame_id(self._model, self._link.value)]
             self._push_origin = link.translation.copy()
         shares = usage(joints, self._limits, self._tau_max)
         with self._server.atomic():

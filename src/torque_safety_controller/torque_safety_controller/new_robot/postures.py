@@ -12,6 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError
+from viability_bounds_pkg.robot.description import frame_id
 
 Array = NDArray[np.float64]
 
@@ -139,7 +140,7 @@ def _held(chain: Chain, q: Array) -> float:
 
 def _start(chain: Chain, touches: SelfCollisions, random: np.random.Generator) -> Array:
     """Return the posture with the best mix of bent joints, middle of ranges and little torque."""
-    data, frame = chain.model.createData(), chain.model.getFrameId(chain.tips[0])
+    data, frame = chain.model.createData(), frame_id(chain.model, chain.tips[0])
     unit = random.random((_STARTS, len(chain.joints)))
     ranked = []
     for q, part in zip(_middle_postures(chain, unit), unit, strict=True):

@@ -35,6 +35,7 @@ from viability_bounds_pkg.node.bounds_parameters import (
 from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
+    frame_id,
     inertia_beyond,
 )
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
@@ -218,7 +219,7 @@ def _interaction(
 ) -> Interaction | None:
     """Return what handles forces; None without a sensor."""
     settings, model = config.interaction, robot.model
-    hand = model.frames[model.getFrameId(robot.frame)]
+    hand = model.frames[frame_id(model, robot.frame)]
     contact, placement = None, None
     if points := settings.points:
         frames = [
@@ -263,9 +264,7 @@ def _frame(
     model: pin.Model, name: str, parameter: str, allowed: str, links: bool = False
 ) -> pin.Frame:
     """Return a frame that a parameter names, one of a link where only these are allowed."""
-    known = {each.name: each for each in reversed(list(model.frames))}  # of a name, the first
-    if links:
-        known = {k: each for k, each in known.items() if each.type == pin.FrameType.BODY}
+    known = {each.name for each in model.frames if not links or each.type == pin.FrameType.BODY}
     if name not in known:
         raise SettingError(parameter, name, allowed + did_you_mean(name, known))
-    return known[name]
+    return model.frames[frame_id(model, name)]

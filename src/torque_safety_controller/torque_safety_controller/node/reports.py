@@ -25,6 +25,7 @@ from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.step import Step, joints_named
 from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.recent_values import RecentValues
+from viability_bounds_pkg.robot.description import frame_id
 from viability_bounds_pkg.ros.messages import JointStateReader, PeriodCheck, pose_message
 from viability_bounds_pkg.ros.runtime import steady_timer
 
@@ -216,7 +217,7 @@ class StatePublisher:
         self._states = states
         self._base_frame, self._base = config.base_frame, base
         self._model, self._data = robot.model, robot.model.createData()
-        self._frame = robot.model.getFrameId(robot.frame)
+        self._frame = frame_id(robot.model, robot.frame)
         self._pose = HAND_POSE.publisher(node)
         self._mode = CONTROLLER_MODE.publisher(node)
         self._last: Mode | None = None

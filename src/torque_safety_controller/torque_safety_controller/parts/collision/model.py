@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from torque_safety_controller.parts.collision.shapes import Shape
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
+from viability_bounds_pkg.robot.description import frame_id
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -110,7 +111,7 @@ def build_collision_model(
         SettingError: an unknown link; named as the node's parameter.
     """
     frames = [_link_frame(model, shape.name) for shape in capsules]
-    root = model.frames[model.getFrameId(base_frame)] if base_frame else model.frames[0]
+    root = model.frames[frame_id(model, base_frame)] if base_frame else model.frames[0]
     frames += [root] * len(obstacles)
     shapes = [*capsules, *obstacles]
     joints = [int(frame.parentJoint) for frame in frames]

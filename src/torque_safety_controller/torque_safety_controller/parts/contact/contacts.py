@@ -22,6 +22,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from torque_safety_controller.qp import ContactForces, WrenchTerm
+from viability_bounds_pkg.robot.description import frame_id
 
 Array = NDArray[np.float64]
 
@@ -66,6 +67,7 @@ class FrictionContact:
 
     def __init__(self, frame: str, points: ArrayLike, normal: ArrayLike, friction: float) -> None:
         self.frame, self.friction = frame, friction
+        self._frame_id: int | None = None
         self.points = np.asarray(points, dtype=float)
         self.normal: Array = np.asarray(normal) / np.linalg.norm(normal)
         self.lever = float(np.linalg.norm(self.points, axis=1).max())
@@ -98,9 +100,9 @@ class FrictionContact:
                 A single point can only exert its force.
             weight: of the squared error.
         """
-        J = pin.getFrameJacobian(
-            model, data, model.getFrameId(self.frame), pin.ReferenceFrame.LOCAL
-        )
+        if self._frame_id is None:  # models of one arm have the same frames
+            self._frame_id = frame_id(model, self.frame)
+        J = pin.getFrameJacobian(model, data, self._frame_id, pin.ReferenceFrame.LOCAL)
         W = self.W if self.exerts_moments else self.W[:3]
         rho_max = np.full(W.shape[1], np.inf)
         return ContactForces(J.T @ self.W, rho_max, [WrenchTerm(W, F_des[: len(W)], weight)])
