@@ -114,7 +114,7 @@ def play(name: str, arm: Arm) -> Row:
         return (f"`{name}`", *[""] * (len(HEADS) - 2), why)
     values = yaml.safe_load((config / f"{name}.yaml").read_text())
     robot = values["/**"]["ros__parameters"]
-    slower = [line.split()[0] for line in lines if " of the URDF's: at higher" in line]
+    slower = [line.split()[0] for line in lines if " of the URDF's: " in line]
     (reached,) = (line for line in lines if line.startswith("scenario: "))
     low = min(map(abs, robot["acceleration_min"] + robot["acceleration_max"]))
     filtered = values["/**/controller_node"]["ros__parameters"].get("safety_filter")

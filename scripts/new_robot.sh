@@ -4,17 +4,19 @@
 set -eu
 usage() {
     cat <<'USAGE'
-usage: bash scripts/new_robot.sh URDF TIP [--base LINK] [--name NAME] [--rate HZ] [--out DIRECTORY]
-                                 [--force]
+usage: bash scripts/new_robot.sh URDF TIP [NAME:=VALUE...] [--base LINK] [--name NAME] [--rate HZ]
+                                 [--velocity-max RAD_S] [--out DIRECTORY] [--force]
        bash scripts/new_robot.sh --topic TIP [options]
        bash scripts/new_robot.sh --table [ARM...]
 
   URDF        URDF file, xacro file, or package:// URI
   TIP         link at the end of the arm; of two arms both: LEFT,RIGHT
+  NAME:=VALUE argument of a xacro file
   --topic     take the URDF from the topic robot_description
   --base      lock the joints before this link
   --name      of the files (default: that of the robot in the URDF)
   --rate      control rate in Hz (default: chosen)
+  --velocity-max  largest speed limit of a joint, rad/s or m/s (default: that of the URDF)
   --out       folder of the files (default: config)
   --force     replace files of this name
   --table     play arms of installed packages, in results/new_robot, and write the table in

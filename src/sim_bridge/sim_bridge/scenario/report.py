@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.scenario.events import EnableTorque, Event, PoseGoal, TrajectoryGoal
 from sim_bridge.scenario.scenario import ScenarioConfiguration
+from viability_bounds_pkg.robot.configuration import units_of
 
 Array = NDArray[np.float64]
 Metrics = dict[str, Any]
@@ -206,13 +207,15 @@ def _metrics(
         "recording_lost_periods": run.lost,
         "joints": {
             name: {
+                "unit": unit,
                 "lower_clearance_rad": low,
                 "upper_clearance_rad": high,
                 "max_speed_ratio": speed,
                 "max_torque_ratio": torque,
             }
-            for name, low, high, speed, torque in zip(
+            for name, unit, low, high, speed, torque in zip(
                 run.joints,
+                units_of(config.urdf, run.joints),
                 _floats(robot, "lower_clearance_rad").tolist(),
                 _floats(robot, "upper_clearance_rad").tolist(),
                 (np.abs(run.v).max(axis=0) / config.velocity_max).tolist(),
@@ -227,7 +230,8 @@ def _print_table(metrics: Metrics) -> None:
     print()
     width = max(map(len, metrics["joints"]))
     print(f"{'joint':<{width}}  to lower limit  to upper limit  top speed  top torque")
-    print(f"{'':<{width}}             rad             rad  of limit     of limit")
+    unit = _units(metrics)
+    print(f"{'':<{width}}{unit:>16}{unit:>16}  of limit     of limit")
     for name, row in metrics["joints"].items():
         print(
             f"{name:<{width}}  {row['lower_clearance_rad']:+14.6f}  "
@@ -254,6 +258,12 @@ def _print_table(metrics: Metrics) -> None:
     print(f"VERDICT: {verdict(metrics)}")
 
 
+def _units(metrics: Metrics, per: str = "") -> str:
+    """Return the units of the joints' positions, or of these per something."""
+    units = dict.fromkeys(row["unit"] + per for row in metrics["joints"].values())
+    return " or ".join(units)
+
+
 def verdict(metrics: Metrics) -> str:
     """Return which limits were broken, if any, and whether every command came in time.
 
@@ -262,9 +272,11 @@ def verdict(metrics: Metrics) -> str:
     """
     q, v = metrics["max_position_violation_rad"], metrics["max_velocity_violation_rad_s"]
     tau = metrics["max_torque_ratio"]
+    joint = metrics["most_violated_joint"]
+    unit = metrics["joints"][joint]["unit"] if joint else ""
     broken = {
-        f"position by {q:.4g} rad ({metrics['most_violated_joint']})": q > TOLERANCE,
-        f"speed by {v:.4g} rad/s": v > TOLERANCE,
+        f"position by {q:.4g} {unit} ({joint})": q > TOLERANCE,
+        f"speed by {v:.4g} {_units(metrics, '/s')}": v > TOLERANCE,
         f"torque, {tau:.4g} of its limit": tau > 1.0 + TOLERANCE,
     }
     said = "no limit was broken, at any physics step"
@@ -308,12 +320,20 @@ def _draw(
     )
     low, high = config.position_min, config.position_max
     j = int(np.argmin(np.minimum(run.q - low, high - run.q).min(axis=0)))
+    of_joint = units_of(config.urdf, run.joints)[j]
+    force = "N m" if of_joint == "rad" else "N"
     for (left, right), (name, unit, values, lower, upper) in zip(
         axes[:3],
         (
-            ("position", "rad", run.q, low, high),
-            ("velocity", "rad/s", run.v, -config.velocity_max, config.velocity_max),
-            ("torque", "N m", run.tau, -config.torque_max, config.torque_max),
+            ("position", of_joint, run.q, low, high),
+            ("velocity", f"{of_joint}/s", run.v, -config.velocity_max, config.velocity_max),
+            (
+                "torque",
+                force,
+                run.tau,
+                -config.torque_max,
+                config.torque_max,
+            ),
         ),
         strict=True,
     ):
@@ -333,7 +353,7 @@ def _draw(
     )
     measured = np.diff(run.v[:, j]) * metrics["rate_hz"]
     acceleration.plot(run.t[:-1], measured, linewidth=1.0, label="measured")
-    acceleration.set(ylabel="acceleration [rad/s$^2$]", xlabel="time [s]")
+    acceleration.set(ylabel=f"acceleration [{of_joint}/s$^2$]", xlabel="time [s]")
     for values, label in zip(errors.T, ("position [mm]", "orientation [mrad]"), strict=True):
         error.semilogy(run.t, np.maximum(1e3 * values, 1e-3), label=label)
     error.set(ylabel="error of the pose goal", xlabel="time [s]")

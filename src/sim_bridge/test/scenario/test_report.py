@@ -16,7 +16,9 @@ KEPT = {
     "max_velocity_violation_rad_s": 0.0,
     "max_torque_ratio": 0.9,
     "most_violated_joint": None,
+    "joints": {"left_e1": {"unit": "rad"}},
 }
+SLIDE = {"joints": {"left_e1": {"unit": "m"}}, "max_velocity_violation_rad_s": 0.5}
 BROKEN = {
     "limits_kept": False,
     "max_position_violation_rad": 0.02,
@@ -36,6 +38,7 @@ REASON = "the promise needs a command in every period"
         (BROKEN | {"braked_periods": 9}, REASON, "speed"),
         (BROKEN | MISSED | {"bounds_method": "naive"}, "deadlines were missed.", REASON),
         (BROKEN | {"max_velocity_violation_rad_s": 0.5}, "speed by 0.5 rad/s", "torque"),
+        (BROKEN | SLIDE, "position by 0.02 m (left_e1); speed by 0.5 m/s.", "rad"),
         ({"limits_kept": False, "max_torque_ratio": 1.2}, "torque, 1.2 of its limit", "position"),
         ({"torque_rates_clipped": True}, "limits are not promised", REASON),
     ],

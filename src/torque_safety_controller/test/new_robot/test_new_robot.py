@@ -12,8 +12,10 @@ import yaml
 from torque_safety_controller.new_robot.chain import NewRobotError, find_chain
 from torque_safety_controller.new_robot.estimates import estimate
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
+from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tools.new_robot import main
 from viability_bounds_pkg.robot.description import load_geometry, read_urdf
+from viability_bounds_pkg.state import State
 
 ROBOTS = "package://example-robot-data/robots/"
 UR5 = ROBOTS + "ur_description/urdf/ur5_robot.urdf"
@@ -136,6 +138,10 @@ BALL = (
     '<link name="ball"><collision><geometry><sphere radius="0.1"/></geometry></collision></link>'
     '<joint name="grip" type="fixed"><parent link="hand"/><child link="ball"/></joint>'
 )
+THUMB = (
+    '<link name="thumb"/><joint name="thumb" type="prismatic"><parent link="upper"/>'
+    f'<child link="thumb"/><axis xyz="0 1 0"/>{LIMIT}</joint>'
+)
 LOOP = '<joint name="rod" type="fixed"><parent link="base"/><child link="hand"/></joint>'
 
 
@@ -150,7 +156,7 @@ LOOP = '<joint name="rod" type="fixed"><parent link="base"/><child link="hand"/>
         (urdf(mass=0), "hand", "", ["'wrist' moves no inertia", "<inertial>"]),
         (urdf(more=LOOP), "hand", "", ["closed loop", "'wrist' and 'rod'"]),
         (urdf(more=FINGER.format("wrist")), "finger", "", ["mimics another", "tip hand"]),
-        (urdf(kind="prismatic"), "hand", "", ["slides", "tip upper"]),
+        (urdf(kind="prismatic", more=THUMB), "hand", "", ["fingers wrist and thumb", "tip upper"]),
         (urdf(kind="floating", limit=""), "hand", "", ["floating", "--base hand"]),
     ],
 )
@@ -161,6 +167,46 @@ def test_what_cannot_work_says_why_and_what_to_do(given, tip, base, words):
     assert "\n" not in text
     for word in words:
         assert word in text
+
+
+def test_all_mistakes_are_told_at_once_a_line_each():
+    given = urdf(limit=LIMIT.replace('effort="30"', ""), mass=-1.0)
+    given = given.replace('"shoulder" type="revolute"', '"shoulder" type="hinge"')
+    with pytest.raises(NewRobotError) as error:
+        find_chain(given, ["hand"])
+    kind, limit, mass = str(error.value).splitlines()
+    assert kind.startswith("joint 'shoulder' is of type 'hinge'; it must be one of revolute,")
+    assert "joint 'wrist' has no effort limit" in limit
+    assert mass == "link 'hand' has a mass of -1 kg"
+
+
+def test_a_joint_that_slides_at_the_end_is_no_gripper_and_has_its_units():
+    chain = find_chain(urdf(kind="prismatic"), ["hand"])
+    assert [chain.units(j) for j in range(2)] == [("rad", "N m"), ("m", "N")]
+    with pytest.raises(NewRobotError, match="'wrist': its effort limit of 0.5 N does.* m/s"):
+        estimate(find_chain(urdf(kind="prismatic", limit=LIMIT.replace("30", "0.5")), ["hand"]))
+
+
+def test_a_speed_limit_that_is_none_is_asked_for():
+    fast = urdf(limit=LIMIT.replace('"4"', '"50000"'))
+    with pytest.raises(
+        NewRobotError, match="'wrist' has 50000 as .*no limit: give --velocity-max"
+    ):
+        find_chain(fast, ["hand"])
+    assert find_chain(fast, ["hand"], velocity_max=3.0).v_max.tolist() == [3.0, 3.0]
+
+
+def test_links_and_joints_may_have_the_same_names():
+    given = urdf(more=BALL).replace('"wrist"', '"upper"').replace('"grip"', '"ball"')
+    chain = find_chain(given, ["ball"])
+    assert chain.joints == ("shoulder", "upper")
+    model, q = chain.model, np.array([0.3, 0.4])
+    robot = RobotModel(model, "ball", 0.0)
+    robot.update(State(q, np.zeros(2)), np.zeros(2))
+    x, _, z = robot.pose.translation
+    np.testing.assert_allclose([x, z], [-0.4 * np.sin(0.3), -0.4 * np.cos(0.3)], atol=1e-12)  # m
+    assert load_geometry(given, model).ngeoms == 1
+    find_postures(chain, SelfCollisions(chain, load_geometry(given, model)))
 
 
 def test_a_motor_that_is_too_weak_is_named():
@@ -206,6 +252,44 @@ def test_a_file_for_xacro_is_expanded(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "xacro", None)  # as if it was not there
     assert run(tmp_path, text, "hand", "--name", "b", name="arm.urdf.xacro") == 1
     assert "pip install xacro, or apt install ros-jazzy-xacro" in capsys.readouterr().err
+
+
+def test_a_xacro_file_gets_arguments_and_finds_packages(tmp_path, monkeypatch, capsys):
+    head = '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+    for name in ("ros", "ament/share"):
+        (tmp_path / name / "described").mkdir(parents=True)
+        part = urdf().replace('effort="30"', 'effort="$(arg effort)"', 1)
+        inside = part[part.index(">") + 1 :]
+        (tmp_path / name / "described" / "arm.xacro").write_text(f"<robot>{inside}")
+    include = '<xacro:include filename="$(find described)/arm.xacro"/></robot>'
+    monkeypatch.delenv("ROS_PACKAGE_PATH", raising=False)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", "")
+    assert run(tmp_path, head + include, "hand", "effort:=30", name="a.xacro") == 1
+    assert "no package 'described' in the folders of ROS_" in capsys.readouterr().err
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "ros"))
+    assert run(tmp_path, head + include, "hand", name="a.xacro") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("a.xacro fails: it has no argument 'effort'; give effort:=VALUE")
+    assert run(tmp_path, head + include, "hand", "effort:=31", name="a.xacro") == 0
+    assert 'effort="31"' in (tmp_path / "arm.urdf").read_text()
+    monkeypatch.delenv("ROS_PACKAGE_PATH")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "ament"))
+    assert run(tmp_path, head + include, "hand", "effort:=32", "--force", name="a.xacro") == 0
+    assert 'effort="32"' in (tmp_path / "arm.urdf").read_text()
+    assert run(tmp_path, urdf(), "hand", "effort:=30") == 1
+    assert "effort: only a xacro file takes arguments" in capsys.readouterr().err
+
+
+def test_a_slow_rate_works_and_nothing_is_left_behind_when_none_does(tmp_path, capsys):
+    out = tmp_path / "out"
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf())
+    assert main([str(path), "hand", "--rate", "20", "--out", str(out)]) == 0
+    written = yaml.safe_load((out / "an_arm.yaml").read_text())
+    assert written["/**"]["ros__parameters"]["rate_hz"] == 20.0
+    none = tmp_path / "none"
+    assert main([str(path), "hand", "--rate", "1", "--out", str(none)]) == 1
+    assert not none.exists()
 
 
 def test_files_are_not_replaced_unasked_and_say_where_numbers_come_from(tmp_path, capsys):

@@ -113,7 +113,8 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
     model = chain.model
     space = _space(chain, chain.v_max)
     worst = search_refined(model, space, SEARCH, 0)
-    scale, why = 1.0, "Those of the URDF: the torque limits leave accelerations at these speeds."
+    of_whom = "those given" if chain.slowed else "the URDF's"
+    scale, reasons, most = 1.0, [], ""
     filtered = np.zeros(len(chain.joints), dtype=bool)
     for required in (USEFUL, LEAST):
         if _room(worst).min() >= required:
@@ -121,10 +122,11 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
         found = largest_velocity_scale(model, space, required)
         if found.scale >= SLOWEST or found.scale * chain.v_max.min() >= FAST:
             scale = float(np.floor(100.0 * found.scale) / 100.0)
-            why = (
-                f"{scale:g} of the URDF's: at higher speeds {found.joint} cannot always "
-                f"accelerate by {required:g} rad/s^2 either way."
-            )
+            slowest = chain.joints.index(found.joint)
+            reasons = [
+                f"at higher speeds {found.joint} cannot always accelerate by {required:g} "
+                f"{chain.units(slowest)[0]}/s^2 either way"
+            ]
             space = _space(chain, rounded(scale * chain.v_max, ROUND_DOWN))
             worst = search_refined(model, space, SEARCH, 0)
             break
@@ -132,8 +134,7 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
         filtered = _room(worst) < LEAST
     overrides: dict[str, tuple[float, float]] = {}
     if filtered.any():
-        overrides, why = _in_most_states(chain, space, filtered)
-    slower = ""
+        overrides, most = _in_most_states(chain, space, filtered)
     while True:
         limits = limits_from_worst_cases(model, space, worst, overrides, CAP)
         a_min, a_max = rounded(limits.a_min, ROUND_DOWN), rounded(limits.a_max, ROUND_DOWN)
@@ -145,9 +146,16 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
             scale = float(f"{SLOWER * scale:.2g}")
             if scale < SLOWEST_FOR_DRIFT and scale * chain.v_max.min() < FAST:
                 raise
-            slower = f" Speeds are {scale:g} of the URDF's because of the drift at this rate."
+            drifts = "at higher speeds accelerations drift too much for this rate"
+            reasons = [*(each for each in reasons if each != drifts), drifts]
             space = _space(chain, rounded(scale * chain.v_max, ROUND_DOWN))
             worst = search_refined(model, space, SEARCH, 0)
+    why = most or (
+        f"Those {'given' if chain.slowed else 'of the URDF'}: the torque limits leave "
+        "accelerations at these speeds."
+    )
+    if scale < 1.0:
+        why = f"{scale:g} of {of_whom}: {'; '.join(reasons)}. {most}".rstrip()
     return Estimates(
         v_max=space.v_max,
         speed_scale=scale,
@@ -159,7 +167,7 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
         unavailable=unavailable_share(model, space, limits),
         rate_hz=rate,
         drift=drift,
-        why=why + slower,
+        why=why,
     )
 
 
@@ -182,12 +190,13 @@ def _in_most_states(
     overrides = {}
     for name in names:
         j = chain.joints.index(name)
+        unit, force = chain.units(j)
         if usual[j] < 0.5 * LEAST:
             raise NewRobotError(
-                f"joint '{name}': its effort limit of {chain.tau_max[j]:g} N m does not leave "
-                f"{0.5 * LEAST:g} rad/s^2 even in {SHARE:.0%} of its states; is that what the "
-                "motor can do? Correct the URDF, narrow its position limits there, or lower its "
-                "velocity limit"
+                f"joint '{name}': its effort limit of {chain.tau_max[j]:g} {force} does not "
+                f"leave {0.5 * LEAST:g} {unit}/s^2 even in {SHARE:.0%} of its states; is "
+                "that what the motor can do? Correct the URDF, narrow its position limits there, "
+                "or lower its velocity limit"
             )
         value = float(min(usual[j], CAP))
         overrides[name] = (-value, value)
@@ -213,7 +222,7 @@ def _drift(
     worst = int(np.argmax(share))
     raise _DriftError(
         f"joint '{chain.joints[worst]}': its acceleration drifts by up to {drift[worst]:.3g} "
-        f"rad/s^3 under a held torque, which at {rates[-1]:g} Hz costs {share[worst]:.0%} of its "
-        f"acceleration limit, more than {DRIFT_SHARE:.0%}; a higher --rate, or a lower velocity "
-        "limit in the URDF"
+        f"{chain.units(worst)[0]}/s^3 under a held torque, which at {rates[-1]:g} Hz costs "
+        f"{share[worst]:.0%} of its acceleration limit, more than {DRIFT_SHARE:.0%}; a higher "
+        "--rate, or a lower velocity limit in the URDF"
     )

@@ -35,10 +35,10 @@ _ROBOT = """\
     rate_hz: {rate}
     # position_min, position_max and torque_max are left out: those of the URDF count.
 {speeds}
-    # rad. Found: bent, near the middle of the ranges; motors hold it with {held:.0%} of their
+    # {rad}. Found: bent, near the middle of the ranges; motors hold it with {held:.0%} of their
     # torque; {checked}.
     start_positions: {start}
-    # rad/s^2. What torque leaves in the worst states found, with {reserve:.0%} of it kept back,
+    # {rad_s2}. What torque leaves in the worst states found, with {reserve:.0%} of it kept back,
     # rounded towards zero, at most {cap:g}.
 {found}
     acceleration_min: {a_min}
@@ -49,10 +49,10 @@ _ROBOT = """\
     method: exact
     # Two control periods ahead avoid chatter.
     bounds_dt_factor: 2.0
-    # rad/s^3. Largest jerk found while a torque is held for a control period, plus 10%;
+    # {rad_s3}. Largest jerk found while a torque is held for a control period, plus 10%;
     # docs/theory/bounds.md.
     acceleration_drift: {drift}
-    # rad. Error of the simulated position in a physics step of h = 1 ms: a h^2 / 8 with the
+    # {rad}. Error of the simulated position in a physics step of h = 1 ms: a h^2 / 8 with the
     # largest acceleration a.
     position_margin: 5.0e-06
 
@@ -104,11 +104,11 @@ def parameter_file(
             f"{', '.join(names)} turn without end: they have no position limits, only limits of "
             "speed, acceleration and torque."
         )
-    speeds += _comment(f"Speeds, rad/s: {e.why}")
-    if e.speed_scale < 1.0:
+    speeds += _comment(f"Speeds, {_unit(chain, '/s')}: {e.why}")
+    if e.speed_scale < 1.0 or chain.slowed:
         speeds.append(f"    velocity_max: {_yaml(e.v_max)}")
     ends = ", ".join(
-        f"{name} [{low:.4g}, {high:.4g}]"
+        f"{name} [{_found(low)}, {_found(high)}]"
         for name, low, high in zip(chain.joints, e.worst_min, e.worst_max, strict=True)
     )
     shares = ", ".join(f"{100.0 * share:.2g}" for share in e.unavailable)
@@ -136,6 +136,9 @@ def parameter_file(
         a_max=_yaml(e.a_max),
         drift=_yaml(e.drift),
         gains=_lines(gains),
+        rad=_unit(chain),
+        rad_s2=_unit(chain, "/s^2"),
+        rad_s3=_unit(chain, "/s^3"),
         filter=_FILTER if e.filtered.any() else "",
     )
 
@@ -154,6 +157,22 @@ def scenario_file(chain: Chain, estimates: Estimates, postures: Postures) -> str
             events += f"  - time: {time:.1f}{note}\n    posture: {_yaml(posture)}\n"
             time += leg
     return _SCENARIO.format(duration=max(time, 1.0), events=events)
+
+
+def _found(acceleration: float) -> str:
+    """Return an acceleration, or that it is far beyond the cap: its digits tell nothing."""
+    if abs(acceleration) < 10.0 * CAP:
+        return f"{acceleration:.4g}"
+    return (
+        f"far {'more' if acceleration > 0.0 else 'less'} than {np.copysign(CAP, acceleration):g}"
+    )
+
+
+def _unit(chain: Chain, per: str = "") -> str:
+    """Return the unit of all joints, such as "rad/s"; a slide's has m in place of rad."""
+    if chain.slides.all():
+        return f"m{per}"
+    return f"rad{per}, m{per} of slides" if chain.slides.any() else f"rad{per}"
 
 
 def _comment(text: str) -> list[str]:

@@ -8,12 +8,14 @@ writes the robot's file, and a scenario that drives it into its limits.
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pinocchio as pin
@@ -31,10 +33,12 @@ from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, mak
 from viability_bounds_pkg.parameter_files import read_files
 from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
-    check_urdf,
     load_geometry,
-    read_urdf,
+    package_folder,
+    parsed_urdf,
     resolve_uri,
+    urdf_text,
+    with_own_package,
 )
 
 Gains = dict[str, float]
@@ -53,6 +57,9 @@ GAINS = {
 OBSERVER_PERIODS = 2.5
 """Time constant of the disturbance observer, control periods, as of the shipped Panda."""
 
+OBSERVER_MAX = 0.1
+"""The largest that its parameter takes, s."""
+
 _ROUNDS = 8
 _INSIDE = 0.9  # of what a gain may be at most
 
@@ -62,7 +69,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         prog="new_robot",
         description="Make the parameter files of an arm from its URDF.",
         epilog="scripts/new_robot.sh runs it, and then the arm. docs/start/your_robot.md tells "
-        "what is found and how.",
+        "what is found and how. NAME:=VALUE is an argument of a xacro file.",
     )
     add = parser.add_argument
     add("urdf", nargs="?", help="URDF or xacro file, or package:// URI")
@@ -71,9 +78,18 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--base", default="", metavar="LINK", help="lock the joints before this link")
     add("--name", default="", help="of the files (default: that in the URDF)")
     add("--rate", type=positive, metavar="HZ", help="control rate (default: chosen)")
+    add(
+        "--velocity-max",
+        type=positive,
+        metavar="RAD_S",
+        help="largest speed limit of a joint, rad/s or m/s (default: the URDF's)",
+    )
     add("--out", type=Path, default=Path("config"), help="folder to write to (default: config)")
     add("--force", action="store_true", help="replace files of this name")
-    options = parser.parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    mappings = [word for word in words if re.match(r"\w+:=", word)]
+    options = parser.parse_args([word for word in words if word not in mappings])
+    options.mappings = dict(word.split(":=", 1) for word in mappings)
     if options.topic == (options.urdf is not None):
         parser.error("either a URDF or --topic must be given, and a tip")
     if options.name and not options.name.isidentifier():
@@ -86,13 +102,21 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def _read(options: argparse.Namespace) -> tuple[str, str, Path | None]:
     """Return the text of the URDF, its source, empty if it must be kept, and its folder."""
     if options.topic:
-        return _from_topic(), "", None
-    path = resolve_uri(options.urdf).resolve()
-    # What xacro has made may have calls of it left in comments.
-    text = re.sub("<!--.*?-->", "", path.read_text(errors="replace"), flags=re.DOTALL)
-    if path.suffix == ".xacro" or "<xacro:" in text:
-        return _through_xacro(path), "", path.parent
-    return read_urdf(str(path)), options.urdf if "://" in options.urdf else str(path), path.parent
+        urdf, source, folder = _from_topic(), "", None
+    else:
+        path = resolve_uri(options.urdf).resolve()
+        urdf, folder = urdf_text(path, str(path)), path.parent
+        # What xacro has made may have calls of it left in comments.
+        bare = re.sub("<!--.*?-->", "", urdf, flags=re.DOTALL)
+        if path.suffix == ".xacro" or "<xacro:" in bare:
+            urdf, source = _through_xacro(path, options.mappings), ""
+        else:
+            source = options.urdf if "://" in options.urdf else str(path)
+    if options.mappings and (source or folder is None):
+        names = ", ".join(options.mappings)
+        raise NewRobotError(f"{names}: only a xacro file takes arguments")
+    parsed_urdf(urdf, source or options.urdf or "robot_description")
+    return urdf, source, folder
 
 
 def _from_topic() -> str:
@@ -108,25 +132,40 @@ def _from_topic() -> str:
         rclpy.try_shutdown()
 
 
-def _through_xacro(path: Path) -> str:
+def _through_xacro(path: Path, mappings: Mapping[str, str]) -> str:
+    """Return the URDF that a xacro file and its arguments make."""
     try:
         import xacro
+        from xacro import substitution_args
     except ImportError as error:
         raise NewRobotError(
             f"{path} is for xacro, which is not installed; pip install xacro, or apt install "
             "ros-jazzy-xacro"
         ) from error
+
+    def find(package: str) -> str:
+        """Return the folder of a package; xacro itself looks at AMENT_PREFIX_PATH only."""
+        return str(package_folder(package, path))
+
+    substitution_args._eval_find = find
     try:
-        urdf: str = xacro.process_file(str(path)).toprettyxml(indent="  ")
+        urdf: str = xacro.process_file(str(path), mappings=dict(mappings)).toprettyxml(indent="  ")
     except Exception as error:  # of many kinds: of its own, of XML, of Python in the file
-        raise NewRobotError(f"xacro {path} fails: {error}; give it what it asks for") from error
-    check_urdf(urdf, str(path))
-    return urdf
+        cause: Any = error
+        while isinstance(inner := getattr(cause, "exc", None), Exception):
+            cause = inner
+        why = " ".join(str(cause).split())
+        remedy = "give it what it asks for"
+        if isinstance(cause, substitution_args.ArgException):
+            why, remedy = f"it has no argument '{cause}'", f"give {cause}:=VALUE"
+        raise NewRobotError(f"xacro {path} fails: {why}; {remedy}") from error
+    return with_own_package(urdf, path)
 
 
 def _run(options: argparse.Namespace) -> int:
     urdf, source, folder = _read(options)
-    chain = find_chain(urdf, options.tip.split(","), options.base)
+    fastest = options.velocity_max or math.inf
+    chain = find_chain(urdf, options.tip.split(","), options.base, fastest)
     chain = replace(chain, name=options.name or chain.name)
     out: Path = options.out
     files = {
@@ -139,8 +178,8 @@ def _run(options: argparse.Namespace) -> int:
     for path in files.values():
         if path.exists() and not options.force:
             raise NewRobotError(f"{path} exists; --force replaces it, --name gives another name")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        check_writable(path)
+        there = next(folder for folder in path.resolve().parents if folder.exists())
+        check_writable(there / path.name)
     _tell_chain(chain)
     print("estimating acceleration limits ...", flush=True)
     estimates = estimate(chain, options.rate)
@@ -157,22 +196,26 @@ def _run(options: argparse.Namespace) -> int:
         f"scenario: {len(postures.goals)} goals, with {int(postures.reached[bounded].sum())} of "
         f"the {2 * int(bounded.sum())} position limits, and back"
     )
-    if "urdf" in files:
-        write_whole(files["urdf"], urdf)
 
-    def robot_text(gains: Gains) -> str:
+    def robot_text(gains: Gains, source: str) -> str:
         return parameter_file(
             chain, estimates, postures, checked=checked, source=source, base=options.base,
             gains=gains,
         )  # fmt: skip
 
-    text = _with_suitable_gains(
-        robot_text, GAINS | {OBSERVER: OBSERVER_PERIODS / estimates.rate_hz}
-    )
+    observer = min(OBSERVER_PERIODS / estimates.rate_hz, OBSERVER_MAX)
+    gains = _suitable_gains(urdf, robot_text, GAINS | {OBSERVER: observer})
+    text = robot_text(gains, source)
     if capsules := capsule_entries(chain.model, geometry):
         text = with_capsules(text, capsules)
-    write_whole(files["robot"], text)
-    write_whole(files["scenario"], scenario_file(chain, estimates, postures))
+    texts = {
+        "robot": text,
+        "scenario": scenario_file(chain, estimates, postures),
+        "urdf": urdf,
+    }
+    for name, path in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, texts[name])
     for name, path in files.items():
         print(f"written: {path} ({name})")
     return 0
@@ -198,25 +241,26 @@ def _shapes(urdf: str, folder: Path | None, model: pin.Model) -> tuple[pin.Geome
     return geometry, "" if geometry.ngeoms else "the URDF has no collision shapes"
 
 
-def _with_suitable_gains(make: Callable[[Gains], str], gains: Gains) -> str:
-    """Return a parameter file with gains lowered until its delay and rate allow them.
+def _suitable_gains(urdf: str, make: Callable[[Gains, str], str], gains: Gains) -> Gains:
+    """Return gains, lowered until the delay and the rate of a parameter file allow them.
 
     Args:
-        make: returns the file with gains.
+        urdf: text of the URDF.
+        make: returns the file with gains, and with the place of a URDF.
         gains: to begin with.
 
     Raises:
         ArmSafetyError: the file leaves no bounds, or no gains suit.
     """
-    for _ in range(_ROUNDS):
-        text = make(gains)
-        with tempfile.NamedTemporaryFile("w", suffix=".yaml") as trial:
-            trial.write(text)
-            trial.flush()
-            beyond = _exceeded(Path(trial.name))
-        if not beyond:
-            return text
-        gains = _lowered(gains, beyond)
+    with tempfile.TemporaryDirectory() as folder:
+        trial, robot = Path(folder) / "trial.yaml", Path(folder) / "robot.urdf"
+        robot.write_text(urdf, encoding="utf-8")
+        for _ in range(_ROUNDS):
+            trial.write_text(make(gains, str(robot)), encoding="utf-8")
+            beyond = _exceeded(trial)
+            if not beyond:
+                return gains
+            gains = _lowered(gains, beyond)
     worst = beyond[0]
     raise NewRobotError(
         f"no gains suit this rate: '{worst.name}' is {worst.value:.4g}, beyond its limit "
@@ -250,20 +294,26 @@ def _lowered(gains: Gains, beyond: Sequence[GainLimit]) -> Gains:
 
 
 def _tell_chain(chain: Chain) -> None:
+    for remark in chain.remarks():
+        print(remark)
     print(f"{chain.name}: {len(chain.joints)} joints, {len(chain.locked)} others locked at 0")
     for j, name in enumerate(chain.joints):
-        ends = f"{chain.q_min[j]:8.3f} to {chain.q_max[j]:7.3f} rad"
+        unit, force = chain.units(j)
+        ends = f"{chain.q_min[j]:8.3f} to {chain.q_max[j]:7.3f} {unit:3}"
         if chain.continuous[j]:
             ends = "  turns without end    "
-        print(f"  {name:28} {ends}, {chain.v_max[j]:6.3f} rad/s, {chain.tau_max[j]:7.2f} N m")
+        print(
+            f"  {name:28} {ends}, {chain.v_max[j]:6.3f} {unit}/s, {chain.tau_max[j]:7.2f} {force}"
+        )
 
 
 def _tell_estimates(chain: Chain, estimates: Estimates) -> None:
     print(estimates.why)
     for j, name in enumerate(chain.joints):
+        unit, _ = chain.units(j)
         print(
-            f"  {name:28} {estimates.a_min[j]:7.2f} to {estimates.a_max[j]:6.2f} rad/s^2, "
-            f"drift {estimates.drift[j]:7.0f} rad/s^3"
+            f"  {name:28} {estimates.a_min[j]:7.2f} to {estimates.a_max[j]:6.2f} {unit}/s^2, "
+            f"drift {estimates.drift[j]:7.0f} {unit}/s^3"
         )
     print(f"control rate: {estimates.rate_hz:g} Hz", flush=True)
 
