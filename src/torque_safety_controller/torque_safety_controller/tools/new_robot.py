@@ -158,6 +158,8 @@ def _through_xacro(path: Path, mappings: Mapping[str, str]) -> str:
         remedy = "give it what it asks for"
         if isinstance(cause, substitution_args.ArgException):
             why, remedy = f"it has no argument '{cause}'", f"give {cause}:=VALUE"
+        elif isinstance(cause, RobotDescriptionError):
+            remedy = "set ROS_PACKAGE_PATH to the folder with it"
         raise NewRobotError(f"xacro {path} fails: {why}; {remedy}") from error
     return with_own_package(urdf, path)
 
