@@ -4,9 +4,12 @@
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from sim_bridge.node.bullet_node import BulletNode
-from torque_safety_controller.node.controller_node import ControllerNode
+from sim_bridge.node.bullet_node import RETRY_PERIOD, BulletNode
+from torque_safety_controller.node.controller_node import QUIET, ControllerNode
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.parameter import parameter_table
+from viability_bounds_pkg.ros.program import SIGNAL_CHECK_PERIOD
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.testing.ros_harness import joint_state, read_config
 
@@ -36,3 +39,15 @@ def test_an_arm_whose_nodes_start_again_goes_on(ros):
         ros.start(type(node), VALUES)
         go_to(goal, within=0.05)  # the shoulder is weak
     ros.assert_limits_kept()
+
+
+def test_a_robot_that_pauses_or_ends_well_is_not_taken_for_silent():
+    (patience,) = (
+        row.default
+        for row in parameter_table(ControllerConfiguration)
+        if row.name == "bounds_timeout"
+    )
+    # A pause begins just after a look at the time at worst.
+    assert QUIET * patience > 2.0 * RETRY_PERIOD
+    # Of programs that are ended at the same time the controller may see the signal last.
+    assert QUIET * patience > SIGNAL_CHECK_PERIOD

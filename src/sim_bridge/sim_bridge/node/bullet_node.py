@@ -44,8 +44,8 @@ from viability_bounds_pkg.ros.topics import (
 
 Array = NDArray[np.float64]
 
-_RETRY_PERIOD = 0.05
-"""Shorter than the 75 ms after which a controller counts the robot as silent, s."""
+RETRY_PERIOD = 0.03
+"""Twice it is shorter than the 75 ms after which a controller counts the robot as silent, s."""
 
 _CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
 
@@ -123,7 +123,7 @@ class BulletNode(ArmNode):
         PAUSE.serve(self, self._on_pause)
         if not config.lockstep:
             steady_timer(self, config.dt, self._tick)
-        steady_timer(self, _RETRY_PERIOD, self._retry)
+        steady_timer(self, RETRY_PERIOD, self._retry)
         if self._clock_publisher is not None:
             self.publisher_watch.add(self._clock_publisher.topic_name)
         self._diagnostics = Diagnostics(self, self._report, self.publisher_watch)
@@ -240,7 +240,7 @@ class BulletNode(ArmNode):
     def _retry(self) -> None:
         """Publish the state again: it may have been lost, or there was no subscriber yet."""
         waiting = self._paused or (self._config.lockstep and not self._advanced)
-        if waiting and time.monotonic() - self._published_at > _RETRY_PERIOD:
+        if waiting and time.monotonic() - self._published_at > RETRY_PERIOD:
             if self._ft_publisher is not None:
                 self._ft_publisher.publish(self._ft_wrench)
             self._state_publisher.publish(self._state)

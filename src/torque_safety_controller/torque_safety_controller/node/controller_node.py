@@ -41,7 +41,7 @@ from viability_bounds_pkg.ros.runtime import steady_timer
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS
 from viability_bounds_pkg.state import State
 
-_QUIET = 1.5
+QUIET = 1.5
 """Time without a joint state after which the robot is silent, in times of `bounds_timeout`."""
 
 
@@ -280,7 +280,7 @@ class ControllerNode(ArmNode):
     def _watch(self) -> None:
         now, config, states = time.monotonic(), self._config, self._states
         nothing = self.publisher_watch.trouble or "no joint state"
-        if now - states.message_at > _QUIET * config.bounds_timeout:
+        if now - states.message_at > QUIET * config.bounds_timeout:
             self._supervisor.silent(nothing)
         elif states.silent(now):
             self._supervisor.silent(states.why_refused or nothing)
