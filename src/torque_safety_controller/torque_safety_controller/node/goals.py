@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -54,6 +56,9 @@ Array = NDArray[np.float64]
 
 WAITING_MAX = 1000
 """So many goals may wait for their time."""
+
+SAME_PERIOD = 1.0
+"""Refusals in a row that differ in numbers only get a line this often, s."""
 
 NEEDED = {
     TARGET_POSE.name: ("pose_weight", "pose_kp"),
@@ -114,6 +119,7 @@ class GoalSubscriber:
         self._waiting: list[_Waiting] = []
         self._contested: set[str] = set()
         self._unserved: set[str] = set()
+        self._told, self._told_at = "", -math.inf
         self.listen(TARGET_POSE, self._on_pose)
         if len(config.end_effectors) > 1:
             self.listen(TARGET_POSE_SECOND, self._on_second_pose)
@@ -167,7 +173,11 @@ class GoalSubscriber:
     def refuse(self, topic: Topic, reason: Exception | str) -> None:
         """Count and log a goal that cannot be followed, or a publisher that cannot be heard."""
         self.refused[topic.name] += 1
-        self._node.get_logger().warning(f"{topic.name} refused: {reason}")
+        text, now = f"{topic.name} refused: {reason}", time.monotonic()
+        kind = "".join(each for each in text if not each.isdigit())
+        if kind != self._told or now - self._told_at > SAME_PERIOD:
+            self._told, self._told_at = kind, now
+            self._node.get_logger().warning(text)
 
     def add(self, topic: Topic, message: Any, apply: Callable[[], None]) -> None:
         """Call `apply` when the time in the header of `message` has come; see `_Waiting`."""
