@@ -149,6 +149,7 @@ LOOP = '<joint name="rod" type="fixed"><parent link="base"/><child link="hand"/>
     ("given", "tip", "base", "words"),
     [
         (urdf(), "hnad", "", ["no link 'hnad'", "did you mean 'hand'"]),
+        (urdf(), "upper", "", ["only joint 'shoulder' moves", "two or more"]),
         (urdf(), "upper", "hand", ["does not hang on 'hand'"]),
         (urdf(limit=LIMIT.replace('effort="30"', "")), "hand", "", ["wrist", "no effort limit"]),
         (urdf(limit=LIMIT.replace('"4"', '"0"')), "hand", "", ["wrist", "velocity", "data sheet"]),
@@ -185,6 +186,13 @@ def test_a_joint_that_slides_at_the_end_is_no_gripper_and_has_its_units():
     assert [chain.units(j) for j in range(2)] == [("rad", "N m"), ("m", "N")]
     with pytest.raises(NewRobotError, match="'wrist': its effort limit of 0.5 N does.* m/s"):
         estimate(find_chain(urdf(kind="prismatic", limit=LIMIT.replace("30", "0.5")), ["hand"]))
+
+
+def test_a_joint_that_carries_too_much_in_every_posture_is_named():
+    given = urdf(kind="prismatic", limit=LIMIT.replace("30", "15")).replace('"0 1 0"', '"0 0 1"')
+    chain = find_chain(given, ["hand"])  # 1 kg on 15 N
+    with pytest.raises(NewRobotError, match="'wrist': to hold .* 65% of its effort .* --base"):
+        find_postures(chain, SelfCollisions(chain, pin.GeometryModel()))
 
 
 def test_a_speed_limit_that_is_none_is_asked_for():

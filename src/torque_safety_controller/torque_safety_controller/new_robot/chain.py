@@ -114,6 +114,8 @@ def find_chain(
         name: each for way in ways for name, each in way.items() if each.get("type") in MOVING
     }
     limits, lacking = _limits(moving, velocity_max)
+    if len(moving) == 1 and not wrong + kinds:
+        wrong.append(f"only joint '{next(iter(moving))}' moves; the controller is for two or more")
     wrong += kinds[:1] or lacking + inertial_mistakes(root, moving)
     if wrong:
         raise NewRobotError("\n".join(wrong))

@@ -154,11 +154,14 @@ def _start(chain: Chain, touches: SelfCollisions, random: np.random.Generator) -
     for _, held, q in sorted(ranked, key=lambda each: each[0]):
         if held <= _HELD_AT_START and not touches(q):
             return np.round(q, 3)
-    least = min(held for _, held, _ in ranked)
-    if least > _HELD_AT_START:
+    least = min(ranked, key=lambda each: each[1])
+    if least[1] > _HELD_AT_START:
+        gravity = pin.computeGeneralizedGravity(chain.model, data, least[2])
+        joint = chain.joints[int(np.argmax(np.abs(gravity) / chain.tau_max))]
         raise NewRobotError(
-            f"to hold the arm takes at least {least:.0%} of a torque limit in {_STARTS} postures; "
-            "are the effort limits of the URDF those of the motors?"
+            f"joint '{joint}': to hold the arm takes at least {least[1]:.0%} of its effort limit "
+            f"in {_STARTS} postures; is that what the motor can do? If so, --base with the link "
+            "behind it leaves it out"
         )
     raise NewRobotError(
         f"links touch each other in each of {_STARTS} postures; correct the <collision> shapes "

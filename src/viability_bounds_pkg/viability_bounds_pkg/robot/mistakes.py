@@ -238,7 +238,9 @@ def _odd_moments(link: Element) -> str:
 def _moments(given: Mapping[str, str]) -> NDArray[np.float64]:
     """Return the moments about the main axes, in order, shape (3,), kg m^2."""
     ixx, ixy, ixz, iyy, iyz, izz = (float(given[key]) for key in _MOMENTS)
-    return np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+    tensor = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+    moments: NDArray[np.float64] = np.linalg.eigvalsh(tensor)
+    return moments
 
 
 def _slack(moments: NDArray[np.float64]) -> float:
