@@ -108,7 +108,7 @@ def inertial_oddities(root: Element, joints: Iterable[str]) -> list[str]:
     return [
         f"link '{link}' {text}"
         for link in dict.fromkeys(moved)
-        if (text := _odd_moments(links[link]))
+        if link in links and (text := _odd_moments(links[link]))
     ]
 
 
