@@ -36,6 +36,7 @@ from sim_bridge.scenario.report import RecordedRun, write_report
 from sim_bridge.scenario.scenario import ScenarioConfiguration
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
 from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.robot.configuration import units_of
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import (
@@ -84,6 +85,7 @@ class ScenarioNode(ArmNode):
         with self.starting():
             config = NodeParameters(self, ScenarioConfiguration).configuration
         self.config = config
+        self._units = units_of(config.urdf, config.joints)
         self.awaits = ""
         self.ended: Future[None] = Future()
         self.failure: ScenarioRefused | None = None
@@ -236,7 +238,8 @@ class ScenarioNode(ArmNode):
         controller = self.recorder.diagnostics["controller_node"]
         state = (
             f"{controller.get('mode', '')}  "
-            f"nearest limit {self.config.joints[nearest]} {distance[nearest]:+.4f} rad"
+            f"nearest limit {self.config.joints[nearest]} {distance[nearest]:+.4f} "
+            f"{self._units[nearest]}"
         )
         error = float(controller.get("position_error_m", "nan"))
         if np.isfinite(error):  # there is a goal

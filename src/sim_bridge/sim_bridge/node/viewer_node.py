@@ -37,6 +37,7 @@ from viability_bounds_pkg.robot.configuration import (
     LimitedRobotConfiguration,
     TaskFrames,
     load_model,
+    units_of,
 )
 from viability_bounds_pkg.robot.description import RobotDescriptionError, frame_id
 from viability_bounds_pkg.ros.arm_node import ArmNode
@@ -286,6 +287,7 @@ def _make_page(config: ViewerConfiguration, urdf: str) -> Page:
         config.limits,
         config.torque_max,
         frames,
+        units_of(urdf, config.joints),
     )
 
 

@@ -84,10 +84,18 @@ class JointPictures:
         joints: their names.
         limits: of the n joints.
         tau_max: torque limits, shape (n,), N m.
+        units: of the joints' positions; rad if not given.
     """
 
-    def __init__(self, joints: Sequence[str], limits: JointLimits, tau_max: Array) -> None:
+    def __init__(
+        self,
+        joints: Sequence[str],
+        limits: JointLimits,
+        tau_max: Array,
+        units: Sequence[str] = (),
+    ) -> None:
         self._joints, self._limits, self._tau_max = tuple(joints), limits, tau_max
+        self._units = units or ("rad",) * len(self._joints)
         self._kernels = _kernels(limits)
 
     def draw(self, values: JointValues) -> str:
@@ -129,7 +137,7 @@ class JointPictures:
         across, down = place(q, v)
         name = escape(self._joints[k])
         distance = min(q - float(limits.q_min[k]), float(limits.q_max[k]) - q)
-        room = f"{distance:+.3f} rad" if math.isfinite(distance) else "no limit"
+        room = f"{distance:+.3f} {self._units[k]}" if math.isfinite(distance) else "no limit"
         return [
             f'<text x="{left}" y="12" font-size="9.5" fill="#333">{name}</text>',
             f'<text x="{left + width}" y="12" font-size="9.5" fill="{fill}" '

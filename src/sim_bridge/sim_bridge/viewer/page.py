@@ -60,6 +60,7 @@ class Page:
         limits: of the n joints.
         tau_max: torque limits, shape (n,), N m.
         frames: names of the base and of the hand.
+        units: of the joints' positions.
 
     Attributes:
         address: of the page.
@@ -73,6 +74,7 @@ class Page:
         limits: JointLimits,
         tau_max: Array,
         frames: tuple[str, str],
+        units: Sequence[str],
     ) -> None:
         self._model, self._data = model, model.createData()
         self._limits, self._tau_max = limits, tau_max
@@ -80,7 +82,7 @@ class Page:
         self._base_pose, self._push_origin = pin.SE3.Identity(), np.zeros(3)
         self._base, self._hand = (frame_id(model, name) for name in frames)
         self._requests: SimpleQueue[Request] = SimpleQueue()
-        self._pictures = JointPictures(limits.names, limits, tau_max)
+        self._pictures = JointPictures(limits.names, limits, tau_max, units)
         self._driving = self._dragging = self._pushing = self._camera_placed = False
         with redirect_stdout(io.StringIO()):  # its banner, even if not verbose
             self._server = viser.ViserServer(*address, label="arm", verbose=False)

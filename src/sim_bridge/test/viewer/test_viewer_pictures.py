@@ -59,6 +59,11 @@ def test_every_state_gives_a_picture_without_nan(q, v, limits):
     assert "<wrist>" in {text.text for text in root.iter(f"{SVG}text")}
 
 
+def test_distances_to_limits_have_the_units_of_the_joints():
+    pictures = JointPictures(LIMITS.names, LIMITS, TAU_MAX, ("m", "rad", "rad"))
+    assert "+1.000 m<" in pictures.draw(values(q=(0.0, 0.0, 0.0)))
+
+
 def test_the_state_on_the_border_is_drawn_on_the_border():
     pictures = JointPictures(LIMITS.names, LIMITS, TAU_MAX)
     root = ElementTree.fromstring(pictures.draw(values(v=(2.0, 0.0, 0.0))))
