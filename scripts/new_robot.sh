@@ -5,7 +5,8 @@ set -eu
 usage() {
     cat <<'USAGE'
 usage: bash scripts/new_robot.sh URDF TIP [NAME:=VALUE...] [--base LINK] [--name NAME] [--rate HZ]
-                                 [--velocity-max RAD_S] [--out DIRECTORY] [--force]
+                                 [--velocity-max RAD_S] [--tool KG,X,Y,Z] [--out DIRECTORY]
+                                 [--force]
        bash scripts/new_robot.sh --topic TIP [options]
        bash scripts/new_robot.sh --table [ARM...]
 
@@ -17,6 +18,7 @@ usage: bash scripts/new_robot.sh URDF TIP [NAME:=VALUE...] [--base LINK] [--name
   --name      of the files (default: that of the robot in the URDF)
   --rate      control rate in Hz (default: chosen)
   --velocity-max  largest speed limit of a joint, rad/s or m/s (default: that of the URDF)
+  --tool      KG,X,Y,Z: mass and centre, m in the axes of the tip, of a tool that is not in the URDF
   --out       folder of the files (default: config)
   --force     replace files of this name
   --table     play arms of installed packages, in results/new_robot, and write the table in

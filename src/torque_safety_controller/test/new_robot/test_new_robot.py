@@ -288,6 +288,19 @@ def test_a_xacro_file_gets_arguments_and_finds_packages(tmp_path, monkeypatch, c
     assert "effort: only a xacro file takes arguments" in capsys.readouterr().err
 
 
+def test_a_tool_is_a_mass_on_the_tip(tmp_path, capsys):
+    assert run(tmp_path, urdf(), "hand", "--tool", "2,0.1,0,-0.05") == 0
+    hand = find_chain((tmp_path / "an_arm.urdf").read_text(), ["hand"]).model.inertias[2]
+    assert hand.mass == pytest.approx(1.0 + 2.0)  # kg
+    np.testing.assert_allclose(hand.lever, [0.2 / 3.0, 0.0, -0.1], atol=1e-12)  # m
+    written = yaml.safe_load((tmp_path / "an_arm.yaml").read_text())
+    source = written["/**"]["ros__parameters"]["robot_description"]
+    assert source == str(tmp_path / "an_arm.urdf")
+    with pytest.raises(SystemExit):
+        run(tmp_path, urdf(), "hand", "--tool", "2")
+    assert "--tool: must be KG,X,Y,Z, is '2'" in capsys.readouterr().err
+
+
 def test_a_slow_rate_works_and_nothing_is_left_behind_when_none_does(tmp_path, capsys):
     out = tmp_path / "out"
     path = tmp_path / "arm.urdf"

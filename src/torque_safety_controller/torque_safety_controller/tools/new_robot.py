@@ -27,7 +27,7 @@ from torque_safety_controller.new_robot.files import parameter_file, scenario_fi
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.tools.fit_capsules import with_capsules
 from torque_safety_controller.tools.gain_limits import OBSERVER, GainLimit, gain_check
-from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
+from viability_bounds_pkg.cli.command_line import Parser, number, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import NODE, check_writable, write_whole
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter_files import read_files
@@ -84,6 +84,12 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         metavar="RAD_S",
         help="largest speed limit of a joint, rad/s or m/s (default: the URDF's)",
     )
+    add(
+        "--tool",
+        type=_tool,
+        metavar="KG,X,Y,Z",
+        help="mass and centre, m in the axes of the tip, of a tool that the URDF does not have",
+    )
     add("--out", type=Path, default=Path("config"), help="folder to write to (default: config)")
     add("--force", action="store_true", help="replace files of this name")
     words = sys.argv[1:] if arguments is None else arguments
@@ -97,6 +103,31 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     if options.rate is not None and options.rate > 1e4:
         parser.error(f"argument --rate: must be at most 10000, is {options.rate:g}")
     return options
+
+
+def _tool(text: str) -> tuple[float, str]:
+    """Return mass, kg, and centre of an argument KG,X,Y,Z."""
+    mass, *centre = text.split(",")
+    if len(centre) != 3:
+        raise argparse.ArgumentTypeError(f"must be KG,X,Y,Z, is '{text}'")
+    return positive(mass), " ".join(f"{number(each):g}" for each in centre)
+
+
+def _with_tool(urdf: str, tip: str, mass: float, centre: str) -> str:
+    """Return a URDF with a mass fixed to a link; unchanged if it has no such link."""
+    root = ElementTree.fromstring(urdf)
+    if tip not in [link.get("name") for link in root.findall("link")]:
+        return urdf
+    name = f"{tip}_tool"
+    inertial = ElementTree.SubElement(ElementTree.SubElement(root, "link", name=name), "inertial")
+    ElementTree.SubElement(inertial, "origin", xyz=centre)
+    ElementTree.SubElement(inertial, "mass", value=f"{mass:g}")
+    moments = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
+    ElementTree.SubElement(inertial, "inertia", moments)
+    joint = ElementTree.SubElement(root, "joint", name=name, type="fixed")
+    ElementTree.SubElement(joint, "parent", link=tip)
+    ElementTree.SubElement(joint, "child", link=name)
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _read(options: argparse.Namespace) -> tuple[str, str, Path | None]:
@@ -166,6 +197,8 @@ def _through_xacro(path: Path, mappings: Mapping[str, str]) -> str:
 
 def _run(options: argparse.Namespace) -> int:
     urdf, source, folder = _read(options)
+    if options.tool:
+        urdf, source = _with_tool(urdf, options.tip.split(",")[0], *options.tool), ""
     fastest = options.velocity_max or math.inf
     chain = find_chain(urdf, options.tip.split(","), options.base, fastest)
     chain = replace(chain, name=options.name or chain.name)
