@@ -251,6 +251,8 @@ def _interaction(
 
 def _robot(config: ControllerConfiguration, model: pin.Model) -> RobotModel:
     frame, (first, *others) = config.end_effector_frame, config.end_effectors
+    if len(config.joints) < 2:
+        raise SettingError("joints", config.joints, "two or more")
     if len(others) > 1 or first in others:
         raise SettingError("end_effector_frame", frame, "a frame of the URDF, or two of them")
     try:
