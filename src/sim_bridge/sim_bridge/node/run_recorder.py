@@ -87,7 +87,7 @@ class RunRecorder:
         }
         self.topics: tuple[str, ...] = ()
         self._joints = tuple(joints)
-        self._reader = JointStateReader(joints)
+        self._reader = JointStateReader(joints, needs_velocities=False)
         self._states: dict[int, tuple[Array, Array]] = {}
         self._limits: dict[int, list[Sequence[float]]] = {}
         self._torques: dict[int, Sequence[float]] = {}

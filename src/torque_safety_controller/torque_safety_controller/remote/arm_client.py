@@ -66,7 +66,8 @@ class StateRecording:
     """
 
     def __init__(self, joints: Sequence[str]) -> None:
-        self._reader, self._n = JointStateReader(joints), len(joints)
+        self._reader = JointStateReader(joints, needs_velocities=False)
+        self._n = len(joints)
         self._stamps: list[int] = []
         self._states: list[tuple[Array, Array, Array]] = []
 
