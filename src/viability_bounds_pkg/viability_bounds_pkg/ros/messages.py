@@ -159,8 +159,10 @@ class JointStateReader:
                 return self._refuse("not finite", "a position or velocity")
         turns = self.turns
         if self._continuous is not None and self.message is not None:
-            turns = whole_turns(q, self.q, self._continuous)
             q = q + turns
+            if max(map(abs, (q - self.q).tolist())) > math.pi:  # seldom, and quick to see
+                leap = whole_turns(q, self.q, self._continuous)
+                q, turns = q + leap, turns + leap
         if unknown is not None and unknown.any():
             v = np.where(unknown, self._slope(q, stamp), v)
         if stamp == self.stamp:
