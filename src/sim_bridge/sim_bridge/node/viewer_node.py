@@ -59,6 +59,13 @@ PERIOD = 0.05
 _SILENT = 1.0
 """Time without joint states after which the page says so, s."""
 _VIOLATIONS = {"position_violation_rad": "rad", "velocity_violation_rad_s": "rad/s"}
+_MODES = {
+    "TRACKING: goal": "follows its goal",
+    "HOLD": "holds the arm",
+    "POSITION": "leaves the arm to the robot's position control",
+    "STOPPED": "sends nothing",
+}
+"""What the controller does, by the start of its status."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -216,18 +223,22 @@ class ViewerNode(ArmNode):
             if self._commands.robot_paused:
                 return "the simulated robot is paused"
             lines.append("**`bounds_node` sends no joint states**")
-        message, controller = self._status.get("controller_node", ("not heard", {}))
-        lines.append(f"**controller**: {message}")
-        if (short := controller.get("short_of_goal", "none")) != "none":
-            lines.append(short)
+        message, _ = self._status.get("controller_node", ("is not heard", {}))
+        for mode, words in _MODES.items():
+            if message.startswith(mode):
+                message = words + message.removeprefix(mode)
+        lines.append(f"**The controller** {message}")
         _, robot = self._status.get("bullet_node", ("", {}))
-        beyond = [
-            f"{max(map(float, robot[key].split())):.2g} {unit}"
+        beyond = {
+            unit: max(map(float, robot[key].split()))
             for key, unit in _VIOLATIONS.items()
             if robot.get(key)
-        ]
-        if beyond:
-            lines.append("beyond a limit so far: " + ", ".join(beyond))
+        }
+        if any(value > 1e-9 for value in beyond.values()):  # not by rounding
+            most = ", ".join(f"{value:.2g} {unit}" for unit, value in beyond.items())
+            lines.append(f"limits of joints were passed, by at most {most}")
+        elif beyond:
+            lines.append("all limits of the joints were kept so far")
         return "  \n".join(lines)
 
     def _on_state(self, message: JointState) -> None:

@@ -16,12 +16,13 @@ from viability_bounds_pkg.viability import viable_velocity_range
 
 Array = NDArray[np.float64]
 
-WIDTH, HEIGHT = 172, 132
+WIDTH, HEIGHT = 172, 136
 """Of the picture of one joint, in units of SVG."""
 COLUMNS = 2
 
 _PLANE = 8.0, 18.0, 156.0, 76.0  # left, top, width, height
-_BARS = 104.0, 118.0  # top of the bars of torque and acceleration
+_WORDS_BELOW = 103.0  # the plane: their base line
+_BARS = 108.0, 122.0  # top of the bars of torque and acceleration
 _BAR_HEIGHT = 8.0
 _WINDOW = math.pi
 """Half the width of the plane of a joint without position limits, rad."""
@@ -30,6 +31,18 @@ _NEAR = 1e-3
 _CALM, _WARNED, _AT_LIMIT = np.array(
     [[96.0, 165.0, 115.0], [240.0, 170.0, 50.0], [205.0, 45.0, 45.0]]
 )
+
+
+LEGEND = (
+    '<div style="font: 11px sans-serif; color: #333; padding: 0 1em">'
+    '<b style="color: #60a573">green</b> is far from the limits of a joint, '
+    '<b style="color: #cd2d2d">red</b> at one, also on the arm. '
+    "<b>●</b> is the state of the joint. In the "
+    '<b style="background: #cfe3f5">blue</b> of its plane it can still brake before its limits. '
+    "<b>τ</b> is its torque, <b>a</b> its acceleration: "
+    '<b style="background: #cfe3f5">blue</b> is what is allowed now.</div>'
+)
+"""What the pictures and colours mean, as HTML."""
 
 
 class JointValues(NamedTuple):
@@ -103,7 +116,7 @@ class JointPictures:
         shares = usage(values, self._limits, self._tau_max)
         rows = -(-len(self._joints) // COLUMNS)
         parts = [
-            f'<svg xmlns="http://www.w3.org/2000/svg" class="joints" width="100%" '
+            f'<svg xmlns="http://www.w3.org/2000/svg" class="joints" width="97%" '
             f'viewBox="0 0 {COLUMNS * WIDTH} {rows * HEIGHT}" font-family="sans-serif">'
         ]
         for k in range(len(self._joints)):
@@ -137,10 +150,17 @@ class JointPictures:
         across, down = place(q, v)
         name = escape(self._joints[k])
         distance = min(q - float(limits.q_min[k]), float(limits.q_max[k]) - q)
-        room = f"{distance:+.3f} {self._units[k]}" if math.isfinite(distance) else "no limit"
+        room = "no position limit"
+        if math.isfinite(distance):
+            room = f"to limit {distance:.3f} {self._units[k]}"
+        small = 'font-size="7.5" fill="#555"'
+        middle = left - 2.0, top + 0.5 * height
         return [
             f'<text x="{left}" y="12" font-size="9.5" fill="#333">{name}</text>',
-            f'<text x="{left + width}" y="12" font-size="9.5" fill="{fill}" '
+            f'<text x="{left}" y="{_WORDS_BELOW}" {small}>position</text>',
+            f'<text transform="translate({middle[0]} {middle[1]}) rotate(-90)" '
+            f'{small} text-anchor="middle">speed</text>',
+            f'<text x="{left + width}" y="{_WORDS_BELOW}" font-size="9" fill="{fill}" '
             f'text-anchor="end">{room}</text>',
             f'<polygon points="{points(box)}" fill="#f4f4f4" stroke="#888"/>',
             f'<polygon points="{points(kernel if kernel is not None else box)}" fill="#cfe3f5" '

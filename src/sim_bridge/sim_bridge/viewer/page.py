@@ -14,7 +14,7 @@ import pinocchio as pin
 import viser
 from numpy.typing import NDArray
 
-from sim_bridge.viewer.joint_pictures import JointPictures, JointValues, colour, usage
+from sim_bridge.viewer.joint_pictures import LEGEND, JointPictures, JointValues, colour, usage
 from sim_bridge.viewer.shapes import VisualShape
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.robot.description import frame_id
@@ -171,11 +171,13 @@ class Page:
         self._handle = scene.add_transform_controls(
             "/push", scale=0.18, disable_rotations=True, visible=False
         )
+        scene.add_label("/goal/label", "goal", anchor="bottom-center")
+        scene.add_label("/push/label", "push", anchor="bottom-center")
         self._goal.on_update(self._on_goal)
         self._handle.on_update(self._on_push)
 
     def _place_camera(self) -> None:
-        """Place the camera so that it sees all of the arm, beside the panel."""
+        """Place the camera so that it sees all of the arm."""
         self._camera_placed = True
         places = (self._data.oMf[self._hand], *list(self._data.oMi)[1:])
         points = np.array([place.translation for place in places])
@@ -183,8 +185,7 @@ class Page:
         middle, size = 0.5 * (low + high), max(float(np.linalg.norm(high - low)), 0.5)
         camera = self._server.initial_camera
         camera.position = tuple(middle + 1.3 * size * np.array([0.9, -1.1, 0.5]))
-        # Aside, as the panel covers the right of the page.
-        camera.look_at = tuple(middle + 0.2 * size * np.array([1.0, 0.8, 0.0]))
+        camera.look_at = tuple(middle)
 
     def _show_goal(self, goal: pin.SE3 | None) -> None:
         """Move the goal's handle to the goal, or to the hand where there is none."""
@@ -204,6 +205,7 @@ class Page:
     def _make_panel(self) -> None:
         gui = self._server.gui
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()  # beside the arm, not over it
         self._text = gui.add_markdown("")
         self._drive = gui.add_checkbox(
             "drive the arm",
@@ -217,6 +219,7 @@ class Page:
             if frame.type == pin.FrameType.BODY and frame.parentJoint > 0
         ] or [""]
         self._link = gui.add_dropdown("push link", links, initial_value=links[len(links) // 2])
+        gui.add_html(LEGEND)
         self._joint_pictures = gui.add_html("")
 
     # What the user does; in threads of the server

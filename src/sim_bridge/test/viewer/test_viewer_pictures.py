@@ -61,7 +61,16 @@ def test_every_state_gives_a_picture_without_nan(q, v, limits):
 
 def test_distances_to_limits_have_the_units_of_the_joints():
     pictures = JointPictures(LIMITS.names, LIMITS, TAU_MAX, ("m", "rad", "rad"))
-    assert "+1.000 m<" in pictures.draw(values(q=(0.0, 0.0, 0.0)))
+    assert "to limit 1.000 m<" in pictures.draw(values(q=(0.0, 0.0, 0.0)))
+
+
+def test_axes_and_the_way_to_the_nearest_limit_are_named():
+    pictures = JointPictures(LIMITS.names, LIMITS, TAU_MAX, ("rad", "m", "rad"))
+    root = ElementTree.fromstring(pictures.draw(values(q=(0.75, -1.5, 0.0))))
+    texts = [text.text for text in root.iter(f"{SVG}text")]
+    assert texts.count("position") == texts.count("speed") == 3
+    rooms = [text for text in texts if "limit" in text]
+    assert rooms == ["to limit 0.250 rad", "to limit 0.500 m", "no position limit"]
 
 
 def test_the_state_on_the_border_is_drawn_on_the_border():
