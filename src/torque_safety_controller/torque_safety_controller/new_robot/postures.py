@@ -145,8 +145,7 @@ def _start(chain: Chain, touches: SelfCollisions, random: np.random.Generator) -
     ranked = []
     for q, part in zip(_middle_postures(chain, unit), unit, strict=True):
         held = _held(chain, q)
-        # Of one joint it is no matrix.
-        J = pin.computeFrameJacobian(chain.model, data, q, frame).reshape(6, -1)
+        J = pin.computeFrameJacobian(chain.model, data, q, frame)
         # A hand that can move in all directions: its least singular value.
         agile = np.linalg.svd(J, compute_uv=False).min()
         off_middle = _MIDDLE * float(np.mean(np.abs(part - 0.5)))
