@@ -31,7 +31,8 @@ from sim_bridge.bullet.robot import BulletRobot
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.ros.arm_node import ArmNode, connect
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor, set_stamp
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES

@@ -14,7 +14,8 @@ from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 
 URDF = "package://example-robot-data/robots/panda_description/urdf/panda.urdf"
 FRAME = "panda_hand"

@@ -18,7 +18,8 @@ from viability_bounds_pkg.acceleration_limits import (
     EmptyIntervalError,
     estimate_acceleration_limits,
 )
-from viability_bounds_pkg.robot.description import build_model, kinematic_order, read_urdf
+from viability_bounds_pkg.robot.description import build_model, kinematic_order
+from viability_bounds_pkg.robot.files import read_urdf
 
 PANDA = "package://example-robot-data/robots/panda_description/urdf/panda.urdf"
 

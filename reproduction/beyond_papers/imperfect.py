@@ -29,7 +29,8 @@ import pinocchio as pin
 from chain import load_node_values, run_chain
 from figure import DIFFERS, Figure, Row, page_rows, table, write_part
 
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.testing.ros_harness import private_domain
 
 PART = "imperfect"

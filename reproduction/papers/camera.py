@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sim_bridge.bullet.client import BulletClient, finite_vector, pybullet, silenced
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.bullet.robot import BulletRobot
-from viability_bounds_pkg.robot.description import resolve_uri
+from viability_bounds_pkg.robot.files import resolve_uri
 
 _OVERSAMPLING = 2  # PyBullet's renderer does not smooth edges
 _NEAR, _FAR = 0.05, 20.0  # m

@@ -21,7 +21,8 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from viability_bounds_pkg import baselines, viability
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 
 sys.path.insert(0, f"{ROOT}/src/viability_bounds_pkg/test/support")
 

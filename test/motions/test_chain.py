@@ -7,7 +7,8 @@ import pytest
 import yaml
 from chain import load_values, run_chain
 
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.testing.ros_harness import config_folder
 
 

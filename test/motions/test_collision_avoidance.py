@@ -10,7 +10,8 @@ from direct import DirectLoop, column
 from sim_bridge.scenario.events import AddObstacle, PoseGoal
 from sim_bridge.scenario.scenario import load_scenario
 from torque_safety_controller.parts.collision.avoidance import Collision
-from viability_bounds_pkg.robot.description import load_geometry, read_urdf
+from viability_bounds_pkg.robot.description import load_geometry
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.testing.ros_harness import config_folder
 
 MARGIN = 0.02  # m

@@ -16,7 +16,8 @@ from sim_bridge.node.viewer_node import PERIOD, PageCommands, ViewerNode
 from sim_bridge.viewer.page import DrivingAsked, GoalAsked, PushAsked
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 KINDS = (ControllerNode, BoundsNode, ViewerNode, BulletNode)

@@ -30,13 +30,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.robot.description import (
-    RobotDescriptionError,
-    build_model,
-    kinematic_order,
-    resolve_uri,
-    unknown_name,
-)
+from viability_bounds_pkg.robot.description import build_model, kinematic_order, unknown_name
+from viability_bounds_pkg.robot.files import RobotDescriptionError, resolve_uri
 
 Array = NDArray[np.float64]
 

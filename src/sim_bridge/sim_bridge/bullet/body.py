@@ -20,7 +20,8 @@ from sim_bridge.bullet.client import BulletClient, finite_vector, pybullet, sile
 from sim_bridge.bullet.obstacles import BulletObstacles, ContactMaterial, LinkWrench
 from sim_bridge.bullet.sensor import ForceTorqueSensor
 from sim_bridge.urdf import FramePlacement, PreparedUrdf, prepare_urdf
-from viability_bounds_pkg.robot.description import RobotDescriptionError, unknown_name
+from viability_bounds_pkg.robot.description import unknown_name
+from viability_bounds_pkg.robot.files import RobotDescriptionError
 
 Array = NDArray[np.float64]
 

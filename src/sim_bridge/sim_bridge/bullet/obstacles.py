@@ -28,7 +28,7 @@ from sim_bridge.bullet.client import BulletClient, finite_vector, pybullet
 from sim_bridge.bullet.friction import ContactFriction
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import Range, above, check, number
-from viability_bounds_pkg.robot.description import RobotDescriptionError
+from viability_bounds_pkg.robot.files import RobotDescriptionError
 
 Array = NDArray[np.float64]
 

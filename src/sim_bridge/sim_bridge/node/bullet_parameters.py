@@ -41,7 +41,7 @@ from viability_bounds_pkg.robot.configuration import (
     LimitedRobotConfiguration,
     load_model,
 )
-from viability_bounds_pkg.robot.description import RobotDescriptionError
+from viability_bounds_pkg.robot.files import RobotDescriptionError
 from viability_bounds_pkg.stop import CoordinatedStop
 
 Array = NDArray[np.float64]

@@ -39,7 +39,8 @@ from viability_bounds_pkg.robot.configuration import (
     load_model,
     units_of,
 )
-from viability_bounds_pkg.robot.description import RobotDescriptionError, frame_id
+from viability_bounds_pkg.robot.description import frame_id
+from viability_bounds_pkg.robot.files import RobotDescriptionError
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import JointStateReader, pose_message, wrench_message
 from viability_bounds_pkg.ros.parameters import NodeParameters

@@ -17,7 +17,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES
-from viability_bounds_pkg.robot.description import RobotDescriptionError
+from viability_bounds_pkg.robot.files import RobotDescriptionError
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 _SHAPES = {Marker.CUBE: "box", Marker.SPHERE: "sphere", Marker.CYLINDER: "cylinder"}

@@ -8,7 +8,8 @@ import pinocchio as pin
 import pytest
 from simulated_robots import AWKWARD, H, Pair, configured
 
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 
 TOLERANCE = 1e-11  # relative; 5e-15 was measured, with rotors 1e-13
 BAXTER = "package://example-robot-data/robots/baxter_description/urdf/baxter.urdf"

@@ -8,7 +8,8 @@ import pytest
 from simulated_robots import configured, locked_joints
 
 from sim_bridge.bullet.obstacles import Obstacle
-from viability_bounds_pkg.robot.description import inertia_beyond, read_urdf
+from viability_bounds_pkg.robot.description import inertia_beyond
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 G = np.array([0.0, 0.0, -9.81])

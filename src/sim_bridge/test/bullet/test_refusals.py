@@ -9,7 +9,7 @@ from simulated_robots import H, single_joint_urdf
 
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.bullet.robot import BulletRobot
-from viability_bounds_pkg.robot.description import RobotDescriptionError, read_urdf
+from viability_bounds_pkg.robot.files import RobotDescriptionError, read_urdf
 
 PANDA = "package://example-robot-data/robots/panda_description/urdf/panda.urdf"
 ARM = [f"panda_joint{i}" for i in range(1, 8)]

@@ -13,7 +13,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from sim_bridge.node.bullet_node import BulletNode
-from viability_bounds_pkg.robot.description import inertia_beyond, read_urdf
+from viability_bounds_pkg.robot.description import inertia_beyond
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.ros.runtime import LATCHED_QOS, stamp_to_ns
 from viability_bounds_pkg.testing.ros_harness import read_config
 

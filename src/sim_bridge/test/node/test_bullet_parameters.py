@@ -10,7 +10,8 @@ from robot_probe import JOINTS, VALUES
 from sensor_msgs.msg import JointState
 
 from sim_bridge.node.bullet_node import BulletNode
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.testing.ros_harness import joint_state, read_config
 
 

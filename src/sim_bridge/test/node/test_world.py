@@ -10,7 +10,8 @@ from geometry_msgs.msg import WrenchStamped
 from robot_probe import MODEL, PERIOD, VALUES, Q, RobotProbe
 from visualization_msgs.msg import Marker, MarkerArray
 
-from viability_bounds_pkg.robot.description import inertia_beyond, read_urdf
+from viability_bounds_pkg.robot.description import inertia_beyond
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 
 

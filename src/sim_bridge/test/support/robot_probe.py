@@ -8,7 +8,8 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.node.bullet_node import BulletNode
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns
 from viability_bounds_pkg.testing.ros_harness import joint_state, read_config
 

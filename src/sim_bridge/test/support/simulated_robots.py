@@ -8,7 +8,8 @@ import pinocchio as pin
 
 from sim_bridge.bullet.friction import JointFriction
 from sim_bridge.bullet.robot import BulletRobot
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 H = 1e-3  # s, the physics step

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from sim_bridge.viewer.joint_pictures import JointPictures, JointValues, usage
 from sim_bridge.viewer.shapes import visual_shapes
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.robot.description import RobotDescriptionError, build_model
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import RobotDescriptionError
 
 LIMITS = JointLimits(
     ("shoulder", "elbow", "<wrist>"),

@@ -13,10 +13,7 @@ from torque_safety_controller.tools.fit_capsules import main
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot.configuration import load_model
-from viability_bounds_pkg.robot.description import (
-    build_model,
-    load_geometry,
-)
+from viability_bounds_pkg.robot.description import build_model, load_geometry
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
 PANDA = read_config("panda", "controller_node")

@@ -11,11 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torque_safety_controller.parts.contact.wrench_sensor import WrenchError, WrenchSensor
-from viability_bounds_pkg.robot.description import (
-    RobotDescriptionError,
-    inertia_beyond,
-    read_urdf,
-)
+from viability_bounds_pkg.robot.description import inertia_beyond
+from viability_bounds_pkg.robot.files import RobotDescriptionError, read_urdf
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 DT = 1e-3

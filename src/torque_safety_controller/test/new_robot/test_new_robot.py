@@ -14,7 +14,8 @@ from torque_safety_controller.new_robot.estimates import estimate
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tools.new_robot import main
-from viability_bounds_pkg.robot.description import load_geometry, read_urdf
+from viability_bounds_pkg.robot.description import load_geometry
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.state import State
 
 ROBOTS = "package://example-robot-data/robots/"

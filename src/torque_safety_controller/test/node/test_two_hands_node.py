@@ -11,7 +11,8 @@ from geometry_msgs.msg import PoseStamped
 from node_chain import pose_message
 
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.testing.ros_harness import read_config
 

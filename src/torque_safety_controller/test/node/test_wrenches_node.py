@@ -16,7 +16,8 @@ from std_srvs.srv import Trigger
 
 from torque_safety_controller.parts.contact.interaction import Interaction
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.robot.description import inertia_beyond, read_urdf
+from viability_bounds_pkg.robot.description import inertia_beyond
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.ros.messages import pose_message, wrench_message
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
 from viability_bounds_pkg.state import State

@@ -11,7 +11,8 @@ import pinocchio as pin
 import pytest
 
 from torque_safety_controller.robot_model import RobotModel
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 ROBOTS = ("baxter_left_arm", "panda")

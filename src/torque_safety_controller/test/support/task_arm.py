@@ -11,7 +11,8 @@ import pinocchio as pin
 from arms import load_arm
 
 from torque_safety_controller.integral_feedback import ArmTerms
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 
 _TALOS = "package://example-robot-data/robots/talos_data/robots/talos_reduced.urdf"
 _TALOS_JOINTS = ["torso_1_joint", "torso_2_joint"] + [f"arm_left_{i}_joint" for i in range(1, 8)]

@@ -6,7 +6,7 @@ import pinocchio as pin
 import pytest
 
 from torque_safety_controller.robot_model import RobotModel
-from viability_bounds_pkg.robot.description import RobotDescriptionError
+from viability_bounds_pkg.robot.files import RobotDescriptionError
 from viability_bounds_pkg.state import State
 
 H = 1e-6  # rad; step of finite differences

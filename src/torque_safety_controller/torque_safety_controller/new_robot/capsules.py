@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.robot.description import RobotDescriptionError
+from viability_bounds_pkg.robot.files import RobotDescriptionError
 
 Array = NDArray[np.float64]
 

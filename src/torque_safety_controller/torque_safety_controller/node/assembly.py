@@ -33,11 +33,8 @@ from viability_bounds_pkg.node.bounds_parameters import (
     make_bounds,
 )
 from viability_bounds_pkg.robot.configuration import load_model
-from viability_bounds_pkg.robot.description import (
-    RobotDescriptionError,
-    frame_id,
-    inertia_beyond,
-)
+from viability_bounds_pkg.robot.description import frame_id, inertia_beyond
+from viability_bounds_pkg.robot.files import RobotDescriptionError
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
 from viability_bounds_pkg.stop import MARGIN
 from viability_bounds_pkg.viability import BoundsSolver

@@ -31,9 +31,9 @@ from viability_bounds_pkg.cli.command_line import Parser, number, positive, run_
 from viability_bounds_pkg.cli.limits_file import NODE, check_writable, write_whole
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter_files import read_files
-from viability_bounds_pkg.robot.description import (
+from viability_bounds_pkg.robot.description import load_geometry
+from viability_bounds_pkg.robot.files import (
     RobotDescriptionError,
-    load_geometry,
     package_folder,
     parsed_urdf,
     resolve_uri,

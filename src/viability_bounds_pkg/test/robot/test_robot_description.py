@@ -11,13 +11,8 @@ from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.parameter_files import ParameterFileError
 from viability_bounds_pkg.robot.configuration import RobotConfiguration, check_with_urdf
-from viability_bounds_pkg.robot.description import (
-    RobotDescriptionError,
-    build_model,
-    kinematic_order,
-    read_urdf,
-    resolve_uri,
-)
+from viability_bounds_pkg.robot.description import build_model, kinematic_order
+from viability_bounds_pkg.robot.files import RobotDescriptionError, read_urdf, resolve_uri
 
 PANDA = "package://example-robot-data/robots/panda_description/urdf/panda.urdf"
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]

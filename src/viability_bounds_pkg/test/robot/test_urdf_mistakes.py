@@ -10,7 +10,7 @@ from viability_bounds_pkg.robot.configuration import (
     check_with_urdf,
     load_model,
 )
-from viability_bounds_pkg.robot.description import RobotDescriptionError, check_urdf, read_urdf
+from viability_bounds_pkg.robot.files import RobotDescriptionError, check_urdf, read_urdf
 from viability_bounds_pkg.testing.two_joint_robot import URDF
 
 LIMITS = 'lower="-1" upper="2" effort="30" velocity="4"'

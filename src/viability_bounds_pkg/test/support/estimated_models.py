@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from functools import cache
 
-from viability_bounds_pkg.robot.description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import read_urdf
 
 ROBOTS = "package://example-robot-data/robots"
 PENDULUM_MASS, PENDULUM_LENGTH, GRAVITY = 2.0, 0.5, 9.81

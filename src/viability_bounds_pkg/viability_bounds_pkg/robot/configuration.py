@@ -26,7 +26,8 @@ from viability_bounds_pkg.parameter import (
     text,
     texts,
 )
-from viability_bounds_pkg.robot.description import RobotDescriptionError, build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.files import RobotDescriptionError, read_urdf
 from viability_bounds_pkg.robot.mistakes import inertial_mistakes, inertial_oddities
 
 Array = NDArray[np.float64]

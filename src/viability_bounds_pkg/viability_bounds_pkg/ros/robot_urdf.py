@@ -9,7 +9,7 @@ from std_msgs.msg import String
 
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot.configuration import TOPIC, RobotConfiguration, check_with_urdf
-from viability_bounds_pkg.robot.description import RobotDescriptionError, check_urdf
+from viability_bounds_pkg.robot.files import RobotDescriptionError, check_urdf
 from viability_bounds_pkg.ros.runtime import make_executor
 from viability_bounds_pkg.ros.topics import ROBOT_DESCRIPTION
 
