@@ -145,6 +145,7 @@ def test_goals_that_cannot_be_followed_are_refused_and_counted(ros):
         joint_state(JOINTS, 0, Q[1:]),
         joint_state(JOINTS, 0, [math.inf, *Q[1:]]),
         joint_state(JOINTS, 0, [*Q[:6], ARM.q_max[6] + 0.01]),
+        joint_state([*JOINTS, JOINTS[0]], 0, [*Q, 0.0]),
     ]
     for topic, publisher, messages in (
         ("target_pose", chain.poses, poses),

@@ -147,6 +147,7 @@ def posture_from_message(message: JointState, config: RobotConfiguration) -> Arr
     """
     if len(message.name) != len(message.position):
         raise GoalRefused(f"{len(message.name)} names but {len(message.position)} positions")
+    _check_once(message.name)
     where = dict(zip(message.name, message.position, strict=True))
     _check_complete(list(where), config.joints)
     q = np.array([where[joint] for joint in config.joints])
@@ -213,6 +214,10 @@ def _check_known(names: Sequence[str], joints: Sequence[str]) -> None:
     for name in names:
         if name not in joints:
             raise GoalRefused(f"unknown joint '{name}'{did_you_mean(name, joints)}")
+    _check_once(names)
+
+
+def _check_once(names: Sequence[str]) -> None:
     if len(set(names)) != len(names):
         raise GoalRefused("a joint is named twice")
 

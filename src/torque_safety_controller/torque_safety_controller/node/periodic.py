@@ -154,8 +154,9 @@ class LimitsReader:
         lower, upper = np.array(first.accelerations), np.array(second.accelerations)
         if not len(lower) == len(upper) == len(message.joint_names):
             return self._refuse("wrong size")
-        if missing := self._order.find(message.joint_names):
-            return self._refuse("missing joint", f"there is no '{missing}'")
+        reason, detail = self._order.find(message.joint_names)
+        if reason:
+            return self._refuse(reason, detail)
         limits = AccelerationRange(lower[self._order.index], upper[self._order.index])
         if fault := limits.fault:
             return self._refuse(fault)

@@ -63,6 +63,7 @@ def test_joints_may_come_in_any_order_with_others_of_which_nothing_matters(order
         (joint_state([*JOINTS, "x"], 2 * SECOND, Q, V), "wrong size", ""),
         (joint_state(["a", "b", "x"], 2 * SECOND, Q, V), "missing joint", "there is no 'c'"),
         (joint_state([], 2 * SECOND), "missing joint", ""),
+        (joint_state([*JOINTS, "b"], 2 * SECOND, [*Q, 0], [*V, 0]), "joint twice", "'b' a second"),
         (joint_state(JOINTS, SECOND - 1, Q, V), "old stamp", ""),
         (joint_state(JOINTS, 0, Q, V), "no stamp", "header.stamp is zero"),
         (joint_state(JOINTS, -5 * SECOND, Q, V), "no stamp", "header.stamp is before zero"),

@@ -40,17 +40,24 @@ class JointOrder:
         self._names: list[str] | None = None
         self.index: slice | NDArray[np.intp] = slice(None)
 
-    def find(self, names: Sequence[str]) -> str:
-        """Set the index for a message's names; return the first missing joint, if any."""
+    def find(self, names: Sequence[str]) -> tuple[str, str]:
+        """Set the index for a message's names.
+
+        Returns:
+            Why it cannot be set, and which joint it is: missing, or there twice; else empty.
+        """
         if names == self._names:
-            return ""
+            return "", ""
         where = {name: i for i, name in enumerate(names)}
-        if missing := next((joint for joint in self._joints if joint not in where), ""):
-            return missing
+        for joint in self._joints:
+            if joint not in where:
+                return "missing joint", f"there is no '{joint}'{did_you_mean(joint, names)}"
+            if names.count(joint) > 1:
+                return "joint twice", f"there is '{joint}' a second time"
         index = [where[joint] for joint in self._joints]
         self._names = list(names)
         self.index = slice(None) if index == list(range(len(names))) else np.array(index)
-        return ""
+        return "", ""
 
 
 def count_refusal(
@@ -137,9 +144,9 @@ class JointStateReader:
         if stamp < self.stamp and not restarted:
             ago = 1e-9 * (self.stamp - stamp)
             return self._refuse("old stamp", f"{ago:.3g} s before that of the last one")
-        if missing := self._order.find(message.name):
-            hint = did_you_mean(missing, message.name)
-            return self._refuse("missing joint", f"there is no '{missing}'{hint}")
+        reason, detail = self._order.find(message.name)
+        if reason:
+            return self._refuse(reason, detail)
         velocity: Sequence[float] = message.velocity
         if not (self._needs_velocities or velocity):
             velocity = [math.nan] * len(message.name)
@@ -291,15 +298,15 @@ class CommandReader:
         velocity = message.velocity or [0.0] * len(message.name)
         fields = [message.effort] if len(message.effort) else [message.position, velocity]
         if any(len(values) != len(message.name) for values in fields):
-            reason = "wrong size"
-        elif self._order.find(message.name):
-            reason = "missing joint"
+            reason, detail = "wrong size", ""
         else:
+            reason, detail = self._order.find(message.name)
+        if not reason:
             arrays = [np.array(values)[self._order.index] for values in fields]
             if all(np.isfinite(each).all() for each in arrays):
                 return TorqueCommand(*arrays) if len(message.effort) else PositionCommand(*arrays)
             reason = "not finite"
-        count_refusal("joint_commands", reason, "", self._refused, self._warn)
+        count_refusal("joint_commands", reason, detail, self._refused, self._warn)
         return None
 
 
