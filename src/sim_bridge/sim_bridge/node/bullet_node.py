@@ -95,7 +95,11 @@ class BulletNode(ArmNode):
         self._advanced = True
         self._refused: Counter[str] = Counter()
         self._world = WorldSubscriber(
-            self, self._robot, config.external_wrench_timeout, self._refused
+            self,
+            self._robot,
+            lambda: self._stamp,
+            config.external_wrench_timeout,
+            self._refused,
         )
         self._ft_wrench = WrenchStamped()
         self._ft_publisher = self.stream(FT_WRENCH) if self._robot.sensor else None

@@ -18,10 +18,17 @@ from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES
 from viability_bounds_pkg.robot.files import RobotDescriptionError
+from viability_bounds_pkg.ros.messages import stamp_fault
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 _SHAPES = {Marker.CUBE: "box", Marker.SPHERE: "sphere", Marker.CYLINDER: "cylinder"}
 _REFUSED = (RobotDescriptionError, ObstacleError, ValueError)
+
+AHEAD_MAX = 3600.0
+"""Messages with stamps further ahead are of another clock, s: scenarios are sent whole."""
+
+WAITING_MAX = 10_000
+"""So many messages may wait for their time."""
 
 
 class _Change(NamedTuple):
@@ -38,11 +45,13 @@ class WorldSubscriber:
     """Subscribes to wrenches and obstacles, and applies them to a robot and its world.
 
     A message with a stamp of zero or in the past takes effect in the next control period, others
-    in the first period that begins at or after their stamp.
+    in the first period that begins at or after their stamp. One that is more than `AHEAD_MAX`
+    ahead is refused: it is of another clock.
 
     Args:
         node: subscribes, and logs refused messages.
         robot: that they act on.
+        now: returns the robot's time, ns.
         wrench_timeout: duration of a wrench unless another message for its link has come or waits
             for its time, s of robot time.
         refused: counts the refused messages and publishers by topic.
@@ -52,10 +61,15 @@ class WorldSubscriber:
     """
 
     def __init__(
-        self, node: Node, robot: BulletRobot, wrench_timeout: float, refused: Counter[str]
+        self,
+        node: Node,
+        robot: BulletRobot,
+        now: Callable[[], int],
+        wrench_timeout: float,
+        refused: Counter[str],
     ) -> None:
         self._logger = node.get_logger()
-        self._robot, self._refused = robot, refused
+        self._robot, self._now, self._refused = robot, now, refused
         self._wrench_timeout = round(1e9 * wrench_timeout)
         self._pending: list[_Change] = []
         self.wrench_ends: dict[str, int] = {}
@@ -95,6 +109,10 @@ class WorldSubscriber:
                 del self.wrench_ends[link]
 
     def _add(self, change: _Change) -> None:
+        if fault := stamp_fault(change.stamp, self._now(), AHEAD_MAX):
+            raise ValueError(fault)
+        if len(self._pending) >= WAITING_MAX:
+            raise ValueError(f"{WAITING_MAX} messages wait for their time already")
         self._pending.append(change)
         self._pending.sort(key=lambda pending: pending.stamp)
 
@@ -106,21 +124,19 @@ class WorldSubscriber:
             self._robot.link_pose(link)  # or it raises
             if not all(map(math.isfinite, force + torque)):
                 raise ValueError("it is not finite")
+            stamp = stamp_to_ns(message.header.stamp)
+            apply = partial(self._robot.apply_wrench, link, force, torque)
+            self._add(_Change(stamp, "external_wrench", link, apply))
         except _REFUSED as error:
             self._refuse("external_wrench", error)
-            return
-        stamp = stamp_to_ns(message.header.stamp)
-        apply = partial(self._robot.apply_wrench, link, force, torque)
-        self._add(_Change(stamp, "external_wrench", link, apply))
 
     def _on_obstacles(self, message: MarkerArray) -> None:
         for marker in message.markers:
             try:
                 apply = self._obstacle_change(marker)
+                self._add(_Change(stamp_to_ns(marker.header.stamp), "obstacles", "", apply))
             except _REFUSED as error:
                 self._refuse("obstacles", error)
-                continue
-            self._add(_Change(stamp_to_ns(marker.header.stamp), "obstacles", "", apply))
 
     def _obstacle_change(self, marker: Marker) -> Callable[[], object]:
         """Return the change that a marker describes.
@@ -129,7 +145,8 @@ class WorldSubscriber:
             ObstacleError: an unknown action or shape, or an invalid obstacle.
             RobotDescriptionError: a frame that the robot does not have.
         """
-        robot, name = self._robot, marker.ns
+        # Markers are told apart by both; scenarios give names alone.
+        robot, name = self._robot, f"{marker.ns}/{marker.id}" if marker.id else marker.ns
         if marker.action == Marker.DELETEALL:
             return robot.obstacles.clear
         if marker.action == Marker.DELETE:

@@ -2,6 +2,7 @@
 """The robot node: pushes and obstacles."""
 
 import math
+import time
 
 import numpy as np
 import pinocchio as pin
@@ -83,6 +84,33 @@ def test_obstacles_come_and_go_with_their_stamps(ros):
     robot.await_reported("world_changes_pending", "1")
     robot.step()
     assert "obstacles: 1;" in robot.reported_now("commands_refused")
+
+
+def test_markers_of_one_namespace_are_obstacles_each(ros):
+    robot = RobotProbe(ros)
+    markers = [marker("wall", position=(2.0, k, 0.3), id=k) for k in range(3)]
+    markers.append(marker("wall", id=2, action=Marker.DELETE))
+    ros.talk(MarkerArray, "obstacles", GOAL_QOS).publish(MarkerArray(markers=markers))
+    robot.await_reported("world_changes_pending", "4")
+    robot.step()
+    assert set(robot.node._robot.obstacles.present) == {"wall", "wall/1"}
+
+
+def test_what_is_stamped_by_another_clock_is_refused_with_the_difference(ros, capfd):
+    """It would wait for ever."""
+    robot = RobotProbe(ros)
+    push = WrenchStamped()
+    push.header.frame_id, push.wrench.force.y = "panda_link4", 30.0
+    set_stamp(push.header.stamp, time.time_ns())
+    ros.talk(WrenchStamped, "external_wrench", GOAL_QOS).publish(push)
+    wall = MarkerArray(markers=[marker("wall", stamp=time.time_ns())])
+    ros.talk(MarkerArray, "obstacles", GOAL_QOS).publish(wall)
+    for told in ("external_wrench: 1;", "obstacles: 1;"):
+        ros.wait_until(lambda told=told: told in robot.reported("commands_refused"), told)
+    assert robot.reported_now("world_changes_pending") == "0"
+    err = capfd.readouterr().err
+    assert "external_wrench refused: header.stamp is " in err
+    assert "it is the wall clock's, the robot has another time; allowed: 3600 s, or 0" in err
 
 
 def test_what_cannot_be_in_the_world_is_dropped_and_counted(ros):

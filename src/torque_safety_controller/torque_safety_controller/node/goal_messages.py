@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -28,6 +27,7 @@ from viability_bounds_pkg.pose_trajectory import (
     TrajectoryPoint,
 )
 from viability_bounds_pkg.robot.configuration import RobotConfiguration
+from viability_bounds_pkg.ros.messages import stamp_fault
 
 Array = NDArray[np.float64]
 
@@ -48,26 +48,9 @@ def check_frame(frame: str, *allowed: str) -> None:
 
 
 def check_stamp(stamp: int, now: int, ahead_max: float, late_max: float = math.inf) -> None:
-    """Refuse a stamp that is far from the robot's time; zero stands for now.
-
-    Args:
-        stamp: of the goal, ns.
-        now: stamp of the newest joint state, ns; -1 if there is none.
-        ahead_max: how far it may be ahead, s.
-        late_max: how long ago it may be, s.
-    """
-    apart = 1e-9 * (stamp - now)
-    if not stamp or now < 0 or -late_max <= apart <= ahead_max:
-        return
-    far, when = abs(apart), "ahead of" if apart > 0.0 else "before"
-    by = f"{far:.3g}" if far < 1e3 else f"{far:.0f}"
-    of_day = 1e-9 * abs(stamp - time.time_ns())
-    clock = ": it is the wall clock's, the robot has another time" if of_day < 0.1 * far else ""
-    allowed = min(ahead_max, late_max)
-    raise GoalRefused(
-        f"header.stamp is {by} s {when} that of the joint states{clock}; allowed: {allowed:g} s, "
-        "or 0"
-    )
+    """Refuse a stamp that is far from the robot's time; see `stamp_fault`."""
+    if fault := stamp_fault(stamp, now, ahead_max, late_max):
+        raise GoalRefused(fault)
 
 
 def numbers_of(*vectors: Vector3) -> Array:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import time
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -67,6 +68,29 @@ def count_refusal(
     refused[reason] += 1
     if warn is not None and refused[reason] == 1:
         warn(f"{topic} refused: {reason}" + (f": {detail}" if detail else ""))
+
+
+def stamp_fault(stamp: int, now: int, ahead_max: float, late_max: float = math.inf) -> str:
+    """Return why a stamp is none of the robot's clock; empty if it may be. Zero stands for now.
+
+    Args:
+        stamp: of a message, ns.
+        now: stamp of the newest joint state, ns; -1 if there is none.
+        ahead_max: how far it may be ahead, s.
+        late_max: how long ago it may be, s.
+    """
+    apart = 1e-9 * (stamp - now)
+    if not stamp or now < 0 or -late_max <= apart <= ahead_max:
+        return ""
+    far, when = abs(apart), "ahead of" if apart > 0.0 else "before"
+    by = f"{far:.3g}" if far < 1e3 else f"{far:.0f}"
+    of_day = 1e-9 * abs(stamp - time.time_ns())
+    clock = ": it is the wall clock's, the robot has another time" if of_day < 0.1 * far else ""
+    allowed = min(ahead_max, late_max)
+    return (
+        f"header.stamp is {by} s {when} that of the joint states{clock}; allowed: {allowed:g} s, "
+        "or 0"
+    )
 
 
 class Arrival(Enum):
