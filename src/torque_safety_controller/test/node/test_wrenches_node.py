@@ -61,13 +61,15 @@ class WrenchChain(ControllerChain):
         self.poses = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
         self.stamp = 0
         self.feels: tuple[str, tuple[float, ...]] | None = None
+        self.felt_at = 0  # stamp of the measurements, ns; 0: none
 
     def step(self) -> np.ndarray:
         """Let 2 ms of robot time pass; return the torques."""
         self.stamp += 2
         if self.feels is not None:
             frame, force = self.feels
-            self.measured.publish(wrench_message(frame, force + WEIGHT[:3], WEIGHT[3:]))
+            force, torque = force + WEIGHT[:3], WEIGHT[3:]
+            self.measured.publish(wrench_message(frame, force, torque, self.felt_at))
         tau = np.array(self.ask(self.stamp, ARM.q_start, np.zeros(ARM.n)).effort)
         assert np.isfinite(tau).all()
         assert (np.abs(tau) <= ARM.tau_max).all()
@@ -96,7 +98,14 @@ def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
     assert "sensor is silent" in hand.reported("message")
     hand.feels = "", (0.0, 30.0, 0.0)
     hand.until("compliance", "yielding")
+    # So is one whose driver repeats the last measurement; new ones count in any clock.
+    hand.felt_at = 5_000_000_000
+    hand.until("compliance", "sensor silent")
+    hand.felt_at = 3_000_000_000
+    hand.until("compliance_changes", str(int(hand.reported("compliance_changes")) + 2))
     # An empty threshold switches it off.
+    hand.felt_at = 0
+    hand.until("compliance", "yielding")
     ros.accepts(NODE, yield_threshold=[])
     hand.until("compliance", "off")
 

@@ -24,7 +24,7 @@ from torque_safety_controller.parts.contact.wrench_sensor import (
     WrenchSensor,
 )
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.runtime import steady_timer
+from viability_bounds_pkg.ros.runtime import stamp_to_ns, steady_timer
 from viability_bounds_pkg.ros.topics import FT_WRENCH
 
 Array = NDArray[np.float64]
@@ -62,6 +62,7 @@ class WrenchSubscriber:
         self._logger = node.get_logger()
         self.refused: Counter[str] = Counter()
         self._changes = 0
+        self._measured_at = 0  # stamp of the last measurement, ns
         goals.listen(TARGET_WRENCH, self._on_target)
         if interaction is None:
             return
@@ -72,6 +73,10 @@ class WrenchSubscriber:
         TARE_FT_SENSOR.serve(node, partial(self._on_tare, interaction, sensor))
 
     def _on_measured(self, sensor: WrenchSensor, message: WrenchStamped) -> None:
+        stamp = stamp_to_ns(message.header.stamp)
+        if stamp and stamp == self._measured_at:
+            return  # a driver repeats what it has; the sensor may be silent
+        self._measured_at = stamp
         try:
             check_frame(message.header.frame_id, self._config.interaction.ft_frame)
             sensor.receive(_wrench(message))

@@ -141,7 +141,7 @@ FT_WRENCH = Topic(
     ("bullet_node",),
     ("controller_node", "scenario_node"),
     "what the wrist sensor measures, tool and bias included, in the axes of `ft_frame`, N and N"
-    " m; positive acts on the arm",
+    " m; positive acts on the arm; a stamp that is repeated is no measurement",
 )
 LIMIT_DISTANCES = Topic(
     "limit_distances",
