@@ -184,6 +184,20 @@ def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
     goes_on_when_it_rests(chain, stamps, "acceleration limits are stale")
 
 
+def test_limits_of_another_clock_are_told_when_their_state_has_waited(ros, capfd):
+    chain = NodeChain(ros, bounds_timeout=0.1)
+
+    def send():
+        chain.bound(7000)
+        chain.state(10)
+
+    chain.await_command(10, send)
+    told = "not the stamp of the joint state"
+    ros.wait_until(lambda: f"{told}: 1;" in chain.reported("limits_refused"), told)
+    line = f"acceleration_limits refused: {told}: header.stamp is 7 s instead of 0.01 s"
+    assert line in capfd.readouterr().err
+
+
 def test_a_controller_that_was_paused_in_motion_lets_the_arm_come_to_rest(ros):
     """It goes on by its goals only then; a shorter row slows the arm, and that is all."""
     chain = NodeChain(ros, bounds_timeout=0.7)

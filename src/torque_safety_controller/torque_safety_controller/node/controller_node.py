@@ -285,6 +285,7 @@ class ControllerNode(ArmNode):
         elif states.silent(now):
             self._supervisor.silent(states.why_refused or nothing)
         elif states.waits(now) > config.bounds_timeout:
+            self._limits.check_clock(states.stamp)
             self._answer(states.message_stamp, None)
 
     def _on_mode(self, mode: Mode, reason: str) -> None:

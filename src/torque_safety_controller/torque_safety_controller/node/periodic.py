@@ -164,6 +164,12 @@ class LimitsReader:
         self.stamp = stamp_to_ns(message.header.stamp)
         return True
 
+    def check_clock(self, stamp: int) -> None:
+        """Refuse the last message where it cannot be meant for a state with a stamp, ns."""
+        if self.stamp >= 0 and abs(self.stamp - stamp) > 1e9 * RESTART_GAP:
+            detail = f"header.stamp is {1e-9 * self.stamp:.13g} s instead of {1e-9 * stamp:.13g} s"
+            self._refuse("not the stamp of the joint state", detail)
+
     def _refuse(self, reason: str, detail: str = "") -> bool:
         count_refusal("acceleration_limits", reason, detail, self.refused, self._warn)
         return False
