@@ -11,57 +11,32 @@ import argparse
 import math
 import re
 import sys
-import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree
-
-import pinocchio as pin
 
 from torque_safety_controller.new_robot.capsules import capsule_entries
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError, find_chain
 from torque_safety_controller.new_robot.estimates import Estimates, estimate
 from torque_safety_controller.new_robot.files import parameter_file, scenario_file
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
+from torque_safety_controller.new_robot.urdf import shapes, through_xacro, with_tool
 from torque_safety_controller.tools.fit_capsules import with_capsules
-from torque_safety_controller.tools.gain_limits import OBSERVER, GainLimit, gain_check
+from torque_safety_controller.tools.suitable_gains import (
+    GAINS,
+    OBSERVER,
+    OBSERVER_MAX,
+    OBSERVER_PERIODS,
+    Gains,
+    suitable_gains,
+)
 from viability_bounds_pkg.cli.command_line import Parser, number, positive, run_tool
-from viability_bounds_pkg.cli.limits_file import NODE, check_writable, write_whole
-from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
-from viability_bounds_pkg.parameter_files import read_files
-from viability_bounds_pkg.robot.description import load_geometry
+from viability_bounds_pkg.cli.limits_file import check_writable, write_whole
 from viability_bounds_pkg.robot.files import (
-    RobotDescriptionError,
-    package_folder,
     parsed_urdf,
     resolve_uri,
     urdf_text,
-    with_own_package,
 )
-
-Gains = dict[str, float]
-
-GAINS = {
-    "pose_kp": 30.0,
-    "pose_kd": -1.0,
-    "pose_weight": 1.0,
-    "posture_kp": 10.0,
-    "posture_kd": -1.0,
-    "posture_weight": 0.001,
-    "hold_kd": 20.0,
-}
-"""Of the controller, to begin with: those of config/panda.yaml."""
-
-OBSERVER_PERIODS = 2.5
-"""Time constant of the disturbance observer, control periods, as of the shipped Panda."""
-
-OBSERVER_MAX = 0.1
-"""The largest that its parameter takes, s."""
-
-_ROUNDS = 8
-_INSIDE = 0.9  # of what a gain may be at most
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -113,23 +88,6 @@ def _tool(text: str) -> tuple[float, str]:
     return positive(mass), " ".join(f"{number(each):g}" for each in centre)
 
 
-def _with_tool(urdf: str, tip: str, mass: float, centre: str) -> str:
-    """Return a URDF with a mass fixed to a link; unchanged if it has no such link."""
-    root = ElementTree.fromstring(urdf)
-    if tip not in [link.get("name") for link in root.findall("link")]:
-        return urdf
-    name = f"{tip}_tool"
-    inertial = ElementTree.SubElement(ElementTree.SubElement(root, "link", name=name), "inertial")
-    ElementTree.SubElement(inertial, "origin", xyz=centre)
-    ElementTree.SubElement(inertial, "mass", value=f"{mass:g}")
-    moments = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
-    ElementTree.SubElement(inertial, "inertia", moments)
-    joint = ElementTree.SubElement(root, "joint", name=name, type="fixed")
-    ElementTree.SubElement(joint, "parent", link=tip)
-    ElementTree.SubElement(joint, "child", link=name)
-    return ElementTree.tostring(root, encoding="unicode")
-
-
 def _read(options: argparse.Namespace) -> tuple[str, str, Path | None]:
     """Return the text of the URDF, its source, empty if it must be kept, and its folder."""
     if options.topic:
@@ -140,7 +98,7 @@ def _read(options: argparse.Namespace) -> tuple[str, str, Path | None]:
         # What xacro has made may have calls of it left in comments.
         bare = re.sub("<!--.*?-->", "", urdf, flags=re.DOTALL)
         if path.suffix == ".xacro" or "<xacro:" in bare:
-            urdf, source = _through_xacro(path, options.mappings), ""
+            urdf, source = through_xacro(path, options.mappings), ""
         else:
             source = options.urdf if "://" in options.urdf else str(path)
     if options.mappings and (source or folder is None):
@@ -163,42 +121,10 @@ def _from_topic() -> str:
         rclpy.try_shutdown()
 
 
-def _through_xacro(path: Path, mappings: Mapping[str, str]) -> str:
-    """Return the URDF that a xacro file and its arguments make."""
-    try:
-        import xacro
-        from xacro import substitution_args
-    except ImportError as error:
-        raise NewRobotError(
-            f"{path} is for xacro, which is not installed; pip install xacro, or apt install "
-            "ros-jazzy-xacro"
-        ) from error
-
-    def find(package: str) -> str:
-        """Return the folder of a package; xacro itself looks at AMENT_PREFIX_PATH only."""
-        return str(package_folder(package, path))
-
-    substitution_args._eval_find = find
-    try:
-        urdf: str = xacro.process_file(str(path), mappings=dict(mappings)).toprettyxml(indent="  ")
-    except Exception as error:  # of many kinds: of its own, of XML, of Python in the file
-        cause: Any = error
-        while isinstance(inner := getattr(cause, "exc", None), Exception):
-            cause = inner
-        why = " ".join(str(cause).split())
-        remedy = "give it what it asks for"
-        if isinstance(cause, substitution_args.ArgException):
-            why, remedy = f"it has no argument '{cause}'", f"give {cause}:=VALUE"
-        elif isinstance(cause, RobotDescriptionError):
-            remedy = "set ROS_PACKAGE_PATH to the folder with it"
-        raise NewRobotError(f"xacro {path} fails: {why}; {remedy}") from error
-    return with_own_package(urdf, path)
-
-
 def _run(options: argparse.Namespace) -> int:
     urdf, source, folder = _read(options)
     if options.tool:
-        urdf, source = _with_tool(urdf, options.tip.split(",")[0], *options.tool), ""
+        urdf, source = with_tool(urdf, options.tip.split(",")[0], *options.tool), ""
     fastest = options.velocity_max or math.inf
     chain = find_chain(urdf, options.tip.split(","), options.base, fastest)
     chain = replace(chain, name=options.name or chain.name)
@@ -219,7 +145,7 @@ def _run(options: argparse.Namespace) -> int:
     print("estimating acceleration limits ...", flush=True)
     estimates = estimate(chain, options.rate)
     _tell_estimates(chain, estimates)
-    geometry, trouble = _shapes(urdf, folder, chain.model)
+    geometry, trouble = shapes(urdf, folder, chain.model)
     touches = SelfCollisions(chain, geometry)
     checked = f"{touches.pairs} pairs of shapes checked"
     if trouble:
@@ -239,7 +165,7 @@ def _run(options: argparse.Namespace) -> int:
         )  # fmt: skip
 
     observer = min(OBSERVER_PERIODS / estimates.rate_hz, OBSERVER_MAX)
-    gains = _suitable_gains(urdf, robot_text, GAINS | {OBSERVER: observer})
+    gains = suitable_gains(urdf, robot_text, GAINS | {OBSERVER: observer})
     text = robot_text(gains, source)
     if capsules := capsule_entries(chain.model, geometry):
         text = with_capsules(text, capsules)
@@ -254,78 +180,6 @@ def _run(options: argparse.Namespace) -> int:
     for name, path in files.items():
         print(f"written: {path} ({name})")
     return 0
-
-
-def _shapes(urdf: str, folder: Path | None, model: pin.Model) -> tuple[pin.GeometryModel, str]:
-    """Return the collision shapes of a robot; without them, why.
-
-    Args:
-        urdf: text of its URDF.
-        folder: of the URDF, where relative names of meshes begin; None if it came from a topic.
-        model: of its joints.
-    """
-    root = ElementTree.fromstring(urdf)
-    for mesh in root.iter("mesh"):
-        name = mesh.get("filename", "")
-        if folder is not None and "://" not in name and (folder / name).is_file():
-            mesh.set("filename", str(folder / name))
-    try:
-        geometry = load_geometry(ElementTree.tostring(root, encoding="unicode"), model)
-    except RobotDescriptionError as error:
-        return pin.GeometryModel(), str(error).splitlines()[0]
-    return geometry, "" if geometry.ngeoms else "the URDF has no collision shapes"
-
-
-def _suitable_gains(urdf: str, make: Callable[[Gains, str], str], gains: Gains) -> Gains:
-    """Return gains, lowered until the delay and the rate of a parameter file allow them.
-
-    Args:
-        urdf: text of the URDF.
-        make: returns the file with gains, and with the place of a URDF.
-        gains: to begin with.
-
-    Raises:
-        ArmSafetyError: the file leaves no bounds, or no gains suit.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        trial, robot = Path(folder) / "trial.yaml", Path(folder) / "robot.urdf"
-        robot.write_text(urdf, encoding="utf-8")
-        for _ in range(_ROUNDS):
-            trial.write_text(make(gains, str(robot)), encoding="utf-8")
-            beyond = _exceeded(trial)
-            if not beyond:
-                return gains
-            gains = _lowered(gains, beyond)
-    worst = beyond[0]
-    raise NewRobotError(
-        f"no gains suit this rate: '{worst.name}' is {worst.value:.4g}, beyond its limit "
-        f"{worst.limit:.3g}; a higher --rate"
-    )
-
-
-def _exceeded(path: Path) -> list[GainLimit]:
-    """Return the gains of a parameter file that are beyond their limits.
-
-    Raises:
-        ArmSafetyError: the file leaves no bounds.
-    """
-    make_bounds(read_files(BoundsConfiguration, [path], NODE))
-    return [each for each in gain_check([path]).limits() if each.exceeded]
-
-
-def _lowered(gains: Gains, beyond: Sequence[GainLimit]) -> Gains:
-    """Return gains, with those that are beyond their limits brought inside."""
-    changed = dict(gains)
-    for each in beyond:
-        task, _, kind = each.name.rpartition("_")
-        share = _INSIDE * each.limit / each.value if each.value else 0.0
-        if each.name == OBSERVER:
-            changed[OBSERVER] = float(f"{each.limit / _INSIDE:.3g}")
-        elif kind == "kd" and f"{task}_kp" in gains:
-            changed[f"{task}_kp"] = float(f"{gains[f'{task}_kp'] * share**2:.3g}")
-        elif each.name in gains:
-            changed[each.name] = float(f"{gains[each.name] * share:.3g}")
-    return changed
 
 
 def _tell_chain(chain: Chain) -> None:
