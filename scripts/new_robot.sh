@@ -6,7 +6,7 @@ usage() {
     cat <<'USAGE'
 usage: bash scripts/new_robot.sh URDF TIP [NAME:=VALUE...] [--base LINK] [--name NAME] [--rate HZ]
                                  [--velocity-max RAD_S] [--tool KG,X,Y,Z] [--out DIRECTORY]
-                                 [--force]
+                                 [--ideal] [--force]
        bash scripts/new_robot.sh --topic TIP [options]
        bash scripts/new_robot.sh --table [ARM...]
 
@@ -20,12 +20,14 @@ usage: bash scripts/new_robot.sh URDF TIP [NAME:=VALUE...] [--base LINK] [--name
   --velocity-max  largest speed limit of a joint, rad/s or m/s (default: that of the URDF)
   --tool      KG,X,Y,Z: mass and centre, m in the axes of the tip, of a tool that is not in the URDF
   --out       folder of the files (default: config)
+  --ideal     only the exact robot, no imperfect one
   --force     replace files of this name
   --table     play arms of installed packages, in results/new_robot, and write the table in
               docs/start/your_robot.md; rows of arms that are not named stay
 
-Writes <name>.yaml, with a comment to each number, and scenarios/<name>_demo.yaml, and plays the
-scenario in lockstep: into limits and back. docs/start/your_robot.md has more.
+Writes <name>.yaml, scenarios/<name>_demo.yaml, and imperfect/<name>.yaml with an assumed robot
+like real ones, a comment to each number. Plays the scenario in lockstep, into limits and back, with
+the exact robot and with the imperfect one. docs/start/your_robot.md has more.
 Exits with 0 when no limit was violated, 1 when one was or no files can be made, 2 when it could
 not run.
 USAGE
@@ -60,10 +62,16 @@ name="$(basename "$config" .yaml)"
 [ -n "$config" ] || exit 0 # it said what it is for
 
 results="$root/results/new_robot/$name"
-echo
-echo "the scenario, in lockstep:"
-status=0
-bash "$root/scripts/demo.sh" "$config" demo --out "$results" || status=$?
+worst=0
+play() { # robot, results, options
+    local status=0
+    echo
+    echo "the scenario with the $1 robot, in lockstep:"
+    bash "$root/scripts/demo.sh" "$config" demo --out "${@:2}" || status=$?
+    [ "$status" -le "$worst" ] || worst="$status"
+}
+play exact "$results"
+! grep -q '^written: .* (imperfect)$' "$log" || play imperfect "$results/imperfect" --imperfect
 echo
 echo "figures and data: $results; again: bash scripts/demo.sh ${config/#"$root/config/$name.yaml"/$name}"
-exit "$status"
+exit "$worst"

@@ -14,6 +14,9 @@ from torque_safety_controller.new_robot.estimates import estimate
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tools.new_robot import main
+from viability_bounds_pkg.cli.limits_file import NODE
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
+from viability_bounds_pkg.parameter_files import node_parameters, read_files
 from viability_bounds_pkg.robot.description import load_geometry
 from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.state import State
@@ -300,6 +303,34 @@ def test_a_tool_is_a_mass_on_the_tip(tmp_path, capsys):
     with pytest.raises(SystemExit):
         run(tmp_path, urdf(), "hand", "--tool", "2")
     assert "--tool: must be KG,X,Y,Z, is '2'" in capsys.readouterr().err
+
+
+def test_an_imperfect_robot_declares_what_is_simulated(tmp_path, capsys):
+    assert run(tmp_path, urdf(), "hand") == 0
+    files = [tmp_path / "an_arm.yaml", tmp_path / "imperfect" / "an_arm.yaml"]
+    declared = read_files(BoundsConfiguration, files, NODE)
+    make_bounds(declared)  # would raise where the errors leave none
+    real = node_parameters(files, "bullet_node")
+    known = declared.declared
+    assert (known.position_error >= 0.5 * np.array(real["encoder_resolution"])).all()
+    assert known.delay == real["command_delay"] == 1
+    assert known.missed_deadlines == real["missed_in_row"] == real["command_timeout"] == 4
+    assert known.motor_bandwidth.tolist() == real["motor_bandwidth"]
+    model = find_chain(urdf(), ["hand"]).model
+    model.armature = np.array(real["rotor_inertia"])
+    rng, data, tau_max = np.random.default_rng(3), model.createData(), 30.0  # N m
+    beyond = []
+    for _ in range(2000):
+        q, v = rng.uniform([-1.0, -1.0], [2.0, 2.0]), rng.uniform(-4.0, 4.0, 2)
+        tau = pin.rnea(model, data, q, v, rng.uniform(real["acceleration_min"], 15.0))
+        wrong = real["torque_constant_error"] * np.clip(tau, -tau_max, tau_max)
+        wrong += rng.uniform(-1.0, 1.0, 2) * real["torque_ripple"] * tau_max
+        wrong -= np.sign(v) * real["friction_coulomb"]
+        error = np.abs(np.linalg.solve(pin.crba(model, data, q), wrong))
+        beyond.append((error > known.acceleration_disturbance).any())
+    assert np.mean(beyond) < 0.01  # declared are 999 of 1000 states of each joint
+    assert run(tmp_path, urdf(), "hand", "--ideal", "--name", "exact") == 0
+    assert not (tmp_path / "imperfect" / "exact.yaml").exists()
 
 
 def test_a_slow_rate_works_and_nothing_is_left_behind_when_none_does(tmp_path, capsys):

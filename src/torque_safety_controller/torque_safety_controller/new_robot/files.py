@@ -14,7 +14,7 @@ from torque_safety_controller.new_robot.chain import Chain
 from torque_safety_controller.new_robot.estimates import CAP, RESERVE, SHARE, Estimates
 from torque_safety_controller.new_robot.postures import Postures
 
-_FILTER = f"""\
+FILTER = f"""\
     # Limits are available in {SHARE:.0%} of states only; docs/theory/whole_arm.md.
     safety_filter: true
 """
@@ -104,9 +104,9 @@ def parameter_file(
             f"{', '.join(names)} turn without end: they have no position limits, only limits of "
             "speed, acceleration and torque."
         )
-    speeds += _comment(f"Speeds, {_unit(chain, '/s')}: {e.why}")
+    speeds += _comment(f"Speeds, {unit_of(chain, '/s')}: {e.why}")
     if e.speed_scale < 1.0 or chain.slowed:
-        speeds.append(f"    velocity_max: {_yaml(e.v_max)}")
+        speeds.append(f"    velocity_max: {yaml_line(e.v_max)}")
     ends = ", ".join(
         f"{name} [{_found(low)}, {_found(high)}]"
         for name, low, high in zip(chain.joints, e.worst_min, e.worst_max, strict=True)
@@ -115,31 +115,31 @@ def parameter_file(
     return _ROBOT.format(
         name=chain.name,
         n=len(chain.joints),
-        source=_yaml(source),
+        source=yaml_line(source),
         base=base or chain.root,
         tips=", ".join(chain.tips),
         locked=len(chain.locked),
-        joints=_yaml(list(chain.joints)),
-        root=_yaml(chain.root),
-        tip=_yaml(chain.tips[0]),
-        rate=_yaml(e.rate_hz),
+        joints=yaml_line(list(chain.joints)),
+        root=yaml_line(chain.root),
+        tip=yaml_line(chain.tips[0]),
+        rate=yaml_line(e.rate_hz),
         speeds="\n".join(speeds),
         held=postures.held,
         checked=checked,
-        start=_yaml(postures.start),
+        start=yaml_line(postures.start),
         reserve=RESERVE,
         cap=CAP,
         found="\n".join(
             _comment(f"Found: {ends}. Not available in {shares} % of 20000 random states.")
         ),
-        a_min=_yaml(e.a_min),
-        a_max=_yaml(e.a_max),
-        drift=_yaml(e.drift),
-        gains=_lines(gains),
-        rad=_unit(chain),
-        rad_s2=_unit(chain, "/s^2"),
-        rad_s3=_unit(chain, "/s^3"),
-        filter=_FILTER if e.filtered.any() else "",
+        a_min=yaml_line(e.a_min),
+        a_max=yaml_line(e.a_max),
+        drift=yaml_line(e.drift),
+        gains=yaml_lines(gains),
+        rad=unit_of(chain),
+        rad_s2=unit_of(chain, "/s^2"),
+        rad_s3=unit_of(chain, "/s^3"),
+        filter=FILTER if e.filtered.any() else "",
     )
 
 
@@ -154,7 +154,7 @@ def scenario_file(chain: Chain, estimates: Estimates, postures: Postures) -> str
         count = int(((goal == chain.q_min) | (goal == chain.q_max)).sum())
         for q, note in ((goal, f" # {count} joints at a limit"), (postures.start, "")):
             posture = dict(zip(chain.joints, q.tolist(), strict=True))
-            events += f"  - time: {time:.1f}{note}\n    posture: {_yaml(posture)}\n"
+            events += f"  - time: {time:.1f}{note}\n    posture: {yaml_line(posture)}\n"
             time += leg
     return _SCENARIO.format(duration=max(time, 1.0), events=events)
 
@@ -168,7 +168,7 @@ def _found(acceleration: float) -> str:
     )
 
 
-def _unit(chain: Chain, per: str = "") -> str:
+def unit_of(chain: Chain, per: str = "") -> str:
     """Return the unit of all joints, such as "rad/s"; a slide's has m in place of rad."""
     if chain.slides.all():
         return f"m{per}"
@@ -181,11 +181,12 @@ def _comment(text: str) -> list[str]:
     )
 
 
-def _lines(values: Mapping[str, Any]) -> str:
-    return "".join(f"    {name}: {_yaml(value)}\n" for name, value in values.items())
+def yaml_lines(values: Mapping[str, Any]) -> str:
+    """Return parameters of a node, a line each."""
+    return "".join(f"    {name}: {yaml_line(value)}\n" for name, value in values.items())
 
 
-def _yaml(value: Any) -> str:
+def yaml_line(value: Any) -> str:
     """Return a value as YAML in one line."""
     value = value.tolist() if isinstance(value, np.ndarray) else value
     text = yaml.safe_dump(value, default_flow_style=True, width=np.inf, sort_keys=False)

@@ -2,7 +2,7 @@
 """Command line tool that makes the parameter files of an arm from its URDF.
 
 Finds joints, limits, a start posture, and gains; estimates acceleration limits, drift and margins;
-writes the robot's file, and a scenario that drives it into its limits.
+writes the robot's file, one of an imperfect robot, and a scenario that drives it into its limits.
 """
 
 from __future__ import annotations
@@ -11,19 +11,35 @@ import argparse
 import math
 import re
 import sys
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from torque_safety_controller.new_robot.capsules import capsule_entries
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError, find_chain
 from torque_safety_controller.new_robot.estimates import Estimates, estimate
 from torque_safety_controller.new_robot.files import parameter_file, scenario_file
+from torque_safety_controller.new_robot.hardware import (
+    ERRORS,
+    ROOM,
+    Array,
+    Errors,
+    acceleration_errors,
+    imperfect_file,
+    with_rotors,
+)
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.new_robot.urdf import shapes, through_xacro, with_tool
 from torque_safety_controller.tools.fit_capsules import with_capsules
 from torque_safety_controller.tools.suitable_gains import (
     GAINS,
+    HORIZON,
+    IMPERFECT_GAINS,
     OBSERVER,
     OBSERVER_MAX,
     OBSERVER_PERIODS,
@@ -32,6 +48,7 @@ from torque_safety_controller.tools.suitable_gains import (
 )
 from viability_bounds_pkg.cli.command_line import Parser, number, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import check_writable, write_whole
+from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.robot.files import (
     parsed_urdf,
     resolve_uri,
@@ -66,6 +83,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="mass and centre, m in the axes of the tip, of a tool that the URDF does not have",
     )
     add("--out", type=Path, default=Path("config"), help="folder to write to (default: config)")
+    add("--ideal", action="store_true", help="write no file of an imperfect robot")
     add("--force", action="store_true", help="replace files of this name")
     words = sys.argv[1:] if arguments is None else arguments
     mappings = [word for word in words if re.match(r"\w+:=", word)]
@@ -133,6 +151,8 @@ def _run(options: argparse.Namespace) -> int:
         "robot": out / f"{chain.name}.yaml",
         "scenario": out / "scenarios" / f"{chain.name}_demo.yaml",
     }
+    if not options.ideal:
+        files["imperfect"] = out / "imperfect" / f"{chain.name}.yaml"
     if not source:
         files["urdf"] = out / f"{chain.name}.urdf"
         source = str(files["urdf"].resolve())
@@ -142,16 +162,17 @@ def _run(options: argparse.Namespace) -> int:
         there = next(folder for folder in path.resolve().parents if folder.exists())
         check_writable(there / path.name)
     _tell_chain(chain)
-    print("estimating acceleration limits ...", flush=True)
-    estimates = estimate(chain, options.rate)
+    with _stage("estimating acceleration limits"):
+        estimates = estimate(chain, options.rate)
     _tell_estimates(chain, estimates)
-    geometry, trouble = shapes(urdf, folder, chain.model)
-    touches = SelfCollisions(chain, geometry)
+    with _stage("looking for postures"):
+        geometry, trouble = shapes(urdf, folder, chain.model)
+        touches = SelfCollisions(chain, geometry)
+        postures = find_postures(chain, touches)
     checked = f"{touches.pairs} pairs of shapes checked"
     if trouble:
         checked = f"not checked for collisions ({trouble})"
         print(f"collisions of the arm with itself are not checked: {trouble}")
-    postures = find_postures(chain, touches)
     bounded = ~chain.continuous
     print(
         f"scenario: {len(postures.goals)} goals, with {int(postures.reached[bounded].sum())} of "
@@ -165,21 +186,99 @@ def _run(options: argparse.Namespace) -> int:
         )  # fmt: skip
 
     observer = min(OBSERVER_PERIODS / estimates.rate_hz, OBSERVER_MAX)
-    gains = suitable_gains(urdf, robot_text, GAINS | {OBSERVER: observer})
+    with _stage("checking gains"):
+        gains = suitable_gains(urdf, lambda *of: [robot_text(*of)], GAINS | {OBSERVER: observer})
     text = robot_text(gains, source)
-    if capsules := capsule_entries(chain.model, geometry):
-        text = with_capsules(text, capsules)
+    with _stage("fitting capsules"):
+        if capsules := capsule_entries(chain.model, geometry):
+            text = with_capsules(text, capsules)
     texts = {
         "robot": text,
         "scenario": scenario_file(chain, estimates, postures),
         "urdf": urdf,
     }
+    if not options.ideal:
+        with _stage("making an imperfect robot"):
+            try:
+                texts["imperfect"] = _imperfect(chain, estimates, gains, urdf, robot_text)
+            except NewRobotError as error:
+                print(error)
+                del files["imperfect"]
     for name, path in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, texts[name])
     for name, path in files.items():
         print(f"written: {path} ({name})")
     return 0
+
+
+def _imperfect(
+    chain: Chain,
+    exact: Estimates,
+    gains: Gains,
+    urdf: str,
+    exact_text: Callable[[Gains, str], str],
+) -> str:
+    """Return the file of an imperfect robot, with the largest errors that leave bounds.
+
+    Args:
+        chain: the arm.
+        exact: its limits without rotors and errors.
+        gains: in its own file.
+        urdf: text of its URDF.
+        exact_text: returns its own file, with gains and the place of the URDF.
+
+    Raises:
+        NewRobotError: no errors leave bounds.
+    """
+    real = with_rotors(chain, exact.v_max)
+    estimates = estimate(real, exact.rate_hz)
+    reason = "they take too much of the acceleration limits"
+    for errors in ERRORS:
+        disturbance = acceleration_errors(real, estimates, errors)
+        if (disturbance > ROOM * np.minimum(-estimates.a_min, estimates.a_max)).any():
+            continue
+
+        def texts(
+            own: Gains, place: str, errors: Errors = errors, disturbance: Array = disturbance
+        ) -> list[str]:
+            changed = {name: value for name, value in own.items() if gains.get(name) != value}
+            imperfect = imperfect_file(real, estimates, errors, disturbance, changed)
+            return [exact_text(gains, place), imperfect]
+
+        try:
+            begin = {**gains, **IMPERFECT_GAINS, HORIZON: errors.horizon}
+            return texts(suitable_gains(urdf, texts, begin), "")[1]
+        except ArmSafetyError as error:  # they leave no bounds, or no gains suit
+            reason = str(error)
+    raise NewRobotError(
+        f"no imperfect robot at {exact.rate_hz:g} Hz: with the least errors {reason}; a higher "
+        "--rate, or a file of your own like those in config/imperfect"
+    )
+
+
+@contextmanager
+def _stage(name: str) -> Iterator[None]:
+    """Tell on stderr what is done, on a terminal with its seconds."""
+    done, begin = threading.Event(), time.monotonic()
+
+    def tell() -> None:
+        while not done.wait(1.0):
+            seconds = time.monotonic() - begin
+            print(f"\r{name}: {seconds:.0f} s", end="", file=sys.stderr, flush=True)
+
+    if not sys.stderr.isatty():
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        yield
+        return
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+        print("\r\033[K", end="", file=sys.stderr, flush=True)
 
 
 def _tell_chain(chain: Chain) -> None:

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from torque_safety_controller.new_robot.chain import NewRobotError
-from torque_safety_controller.tools.gain_limits import OBSERVER, GainLimit, gain_check
+from torque_safety_controller.tools.gain_limits import HORIZON, OBSERVER, GainLimit, gain_check
 from viability_bounds_pkg.cli.limits_file import NODE
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter_files import read_files
@@ -26,6 +27,9 @@ GAINS = {
 }
 """Of the controller, to begin with: those of config/panda.yaml."""
 
+IMPERFECT_GAINS = {"integral_lambda": 30.0, OBSERVER: 0.012}
+"""Of the controller of an imperfect robot, to begin with: those of config/imperfect/panda.yaml."""
+
 OBSERVER_PERIODS = 2.5
 """Time constant of the disturbance observer, control periods, as of the shipped Panda."""
 
@@ -36,23 +40,26 @@ _ROUNDS = 8
 _INSIDE = 0.9  # of what a gain may be at most
 
 
-def suitable_gains(urdf: str, make: Callable[[Gains, str], str], gains: Gains) -> Gains:
-    """Return gains, lowered until the delay and the rate of a parameter file allow them.
+def suitable_gains(urdf: str, make: Callable[[Gains, str], Sequence[str]], gains: Gains) -> Gains:
+    """Return gains, lowered until the delay and the rate of parameter files allow them.
 
     Args:
         urdf: text of the URDF.
-        make: returns the file with gains, and with the place of a URDF.
+        make: returns the files with gains, and with the place of a URDF.
         gains: to begin with.
 
     Raises:
-        ArmSafetyError: the file leaves no bounds, or no gains suit.
+        ArmSafetyError: the files leave no bounds, or no gains suit.
     """
     with tempfile.TemporaryDirectory() as folder:
-        trial, robot = Path(folder) / "trial.yaml", Path(folder) / "robot.urdf"
+        robot = Path(folder) / "robot.urdf"
         robot.write_text(urdf, encoding="utf-8")
         for _ in range(_ROUNDS):
-            trial.write_text(make(gains, str(robot)), encoding="utf-8")
-            beyond = _exceeded(trial)
+            trials = []
+            for k, text in enumerate(make(gains, str(robot))):
+                trials.append(Path(folder) / f"{k}.yaml")
+                trials[-1].write_text(text, encoding="utf-8")
+            beyond = _exceeded(trials)
             if not beyond:
                 return gains
             gains = _lowered(gains, beyond)
@@ -63,14 +70,14 @@ def suitable_gains(urdf: str, make: Callable[[Gains, str], str], gains: Gains) -
     )
 
 
-def _exceeded(path: Path) -> list[GainLimit]:
-    """Return the gains of a parameter file that are beyond their limits.
+def _exceeded(paths: Sequence[Path]) -> list[GainLimit]:
+    """Return the gains of parameter files that are beyond their limits.
 
     Raises:
-        ArmSafetyError: the file leaves no bounds.
+        ArmSafetyError: the files leave no bounds.
     """
-    make_bounds(read_files(BoundsConfiguration, [path], NODE))
-    return [each for each in gain_check([path]).limits() if each.exceeded]
+    make_bounds(read_files(BoundsConfiguration, paths, NODE))
+    return [each for each in gain_check(paths).limits() if each.exceeded]
 
 
 def _lowered(gains: Gains, beyond: Sequence[GainLimit]) -> Gains:
@@ -79,10 +86,12 @@ def _lowered(gains: Gains, beyond: Sequence[GainLimit]) -> Gains:
     for each in beyond:
         task, _, kind = each.name.rpartition("_")
         share = _INSIDE * each.limit / each.value if each.value else 0.0
-        if each.name == OBSERVER:
+        if each.name == HORIZON and HORIZON in gains and math.isfinite(each.limit):
+            changed[HORIZON] = float(math.ceil(each.limit / _INSIDE))
+        elif each.name == OBSERVER:
             changed[OBSERVER] = float(f"{each.limit / _INSIDE:.3g}")
         elif kind == "kd" and f"{task}_kp" in gains:
             changed[f"{task}_kp"] = float(f"{gains[f'{task}_kp'] * share**2:.3g}")
-        elif each.name in gains:
+        elif each.name in gains and each.name != HORIZON:
             changed[each.name] = float(f"{gains[each.name] * share:.3g}")
     return changed
