@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from controller_chain import MS
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped
 from node_chain import (
     ARM,
     GOAL,
@@ -26,14 +26,16 @@ from node_chain import (
     torque_for,
 )
 from rclpy.qos import qos_profile_system_default
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from torque_safety_controller.node import goals
 from torque_safety_controller.node.goal_messages import pose_from_message
 from torque_safety_controller.node.periodic import StateStream
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.ros.messages import Arrival
-from viability_bounds_pkg.ros.runtime import LATCHED_QOS, STATUS_QOS
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS, STATUS_QOS
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import acceleration_limits, joint_state
 
@@ -194,6 +196,44 @@ def test_goals_take_effect_at_their_stamps(ros):
         wanted = core.step(State(Q, V), AccelerationRange(LOWER, UPPER)).tau
         np.testing.assert_allclose(chain.answer(stamp), wanted, atol=1e-4, err_msg=f"{stamp} ms")
     chain.await_goals(0)
+
+
+def test_a_goal_at_rest_ends_the_velocity_of_what_moved_before(ros):
+    """Else the arm would stand off by it for ever."""
+    chain = NodeChain(ros)
+    targets = chain.node._controller.goals
+    trajectory = JointTrajectory(joint_names=JOINTS)
+    trajectory.points = [JointTrajectoryPoint(positions=GOAL_Q.tolist())]
+    trajectory.points[0].time_from_start.sec = 1
+    jog = TwistStamped()
+    jog.twist.linear.x = 0.1
+    for stamp, publisher, message, moves in (
+        (10, ros.talk(JointTrajectory, "target_joint_trajectory", GOAL_QOS), trajectory, "v"),
+        (20, chain.poses, pose_message(GOAL), ""),
+        (30, ros.talk(TwistStamped, "jog_hand", GOAL_QOS), jog, "motion"),
+        (40, chain.postures, joint_state(JOINTS, 0, Q), ""),
+    ):
+        publisher.publish(message)
+        chain.await_goals()
+        chain.answer(stamp)
+        moving = [part for part in ("v", "motion") if getattr(targets.targets, part) is not None]
+        assert moving == list(filter(None, [moves])), stamp
+
+
+def test_jogs_that_waited_for_the_robot_are_dropped(ros, capfd):
+    chain = NodeChain(ros)
+    jogs = ros.talk(JointState, "jog_joints", GOAL_QOS)
+    chain.answer(10)
+    jogs.publish(JointState(name=JOINTS[:1], velocity=[0.1]))
+    chain.await_goals()
+    chain.answer(400)
+    ros.wait_until(lambda: "jog_joints: 1;" in chain.reported("goals_refused"), "the refusal")
+    assert "no joint state has come within 0.25 s of it" in capfd.readouterr().err
+    assert chain.reported("mode") == "HOLD"
+    jogs.publish(JointState(name=JOINTS[:1], velocity=[0.1]))
+    chain.await_goals()
+    chain.answer(402)
+    chain.await_mode("TRACKING")
 
 
 def test_a_goal_that_waits_is_told_and_one_of_another_clock_is_refused(ros, monkeypatch, capfd):

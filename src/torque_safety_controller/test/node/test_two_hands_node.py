@@ -9,6 +9,7 @@ import pytest
 from controller_chain import NODE, ControllerChain, controller_of, patient_values
 from geometry_msgs.msg import PoseStamped
 from node_chain import pose_message
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot.description import build_model
@@ -63,6 +64,16 @@ def test_each_hand_goes_to_the_goal_of_its_topic(ros):
     second.publish(pose_message(goals[0], "elsewhere"))
     ros.wait_until(lambda: "target_pose_second" in chain.reported("goals_refused"), "the refusal")
     np.testing.assert_allclose(found(12, 0), wanted, atol=0.05)
+    # A motion of the joints releases both hands, and ends with a goal for one of them.
+    joints = ros.talk(JointTrajectory, "target_joint_trajectory", GOAL_QOS)
+    rests = JointTrajectory(joint_names=VALUES["joints"])
+    rests.points = [JointTrajectoryPoint(positions=Q.tolist())]
+    rests.points[0].time_from_start.sec = 9
+    joints.publish(rests)
+    np.testing.assert_allclose(found(13, 1), np.zeros((2, 3)), atol=0.05)
+    second.publish(pose_message(goals[1], VALUES["base_frame"]))
+    _, moved = found(14, 1)
+    assert np.linalg.norm(moved - wanted[1]) < 0.02 * np.linalg.norm(wanted[1])
 
 
 @pytest.mark.parametrize(

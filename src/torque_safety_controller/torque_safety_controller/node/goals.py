@@ -87,9 +87,9 @@ class GoalSubscriber:
     next control step; one ahead takes effect with the first state at or after it, which makes a
     plan of goals repeatable. One that is further ahead than `goal_ahead_max` is refused: it is of
     another clock. So are jogs with a stamp that differs from that of the newest joint state by
-    more than `TIMEOUT`, and trajectories that have passed. Where several nodes
-    publish one of these topics, what comes on it is refused, and the arm is to hold until there
-    is one.
+    more than `TIMEOUT`, then or when they are due, and trajectories that have passed. Where
+    several nodes publish one of these topics, what comes on it is refused, and the arm is to hold
+    until there is one.
 
     Args:
         node: listens and logs what is refused.
@@ -100,7 +100,6 @@ class GoalSubscriber:
 
     Attributes:
         refused: how many goals, and publishers of goals, were refused, by topic.
-        motion: sets the goal in each control step; None for goals at rest.
     """
 
     def __init__(
@@ -115,7 +114,7 @@ class GoalSubscriber:
         self._controller, self._config, self._base = controller, config, base
         self._states, self._held = states, controller.goals.held
         self.refused: Counter[str] = Counter()
-        self.motion: Motion | None = None
+        self._motion: Motion | None = None
         self._waiting: list[_Waiting] = []
         self._contested: set[str] = set()
         self._unserved: set[str] = set()
@@ -131,6 +130,16 @@ class GoalSubscriber:
 
     def __len__(self) -> int:
         return len(self._waiting)
+
+    @property
+    def motion(self) -> Motion | None:
+        """What sets the goal in each control step; None for goals at rest."""
+        return self._motion
+
+    @motion.setter
+    def motion(self, motion: Motion | None) -> None:
+        self._motion = motion
+        self._controller.goals.come_to_rest()  # where the one before leaves them
 
     @property
     def due(self) -> str:
@@ -252,8 +261,13 @@ class GoalSubscriber:
 
     def _on_second_pose(self, message: PoseStamped) -> None:
         pose = self._base * pose_from_message(message, self._config.base_frame)
-        goals = self._controller.goals
-        self.add(TARGET_POSE_SECOND, message, lambda: goals.set_other_pose(0, pose))
+
+        def apply() -> None:
+            if isinstance(self.motion, JointMotion | JointJog):  # which release the hands
+                self.motion = None
+            self._controller.goals.set_other_pose(0, pose)
+
+        self.add(TARGET_POSE_SECOND, message, apply)
 
     def _on_posture(self, message: JointState) -> None:
         q_des = posture_from_message(message, self._config)
@@ -297,7 +311,6 @@ class GoalSubscriber:
         twist = numbers_of(message.twist.linear, message.twist.angular)
         if not np.isfinite(twist).all():
             raise GoalRefused("twist is not finite")
-        self._check_jog(message)
         in_hand = frame == hand
         if not in_hand:
             twist = (twist.reshape(2, 3) @ self._base.rotation.T).ravel()
@@ -310,12 +323,11 @@ class GoalSubscriber:
                 self.motion = motion
             motion.command_twist(twist, in_hand)
 
-        self.add(JOG_HAND, message, jog)
+        self._add_jog(JOG_HAND, message, jog)
 
     def _on_joint_jog(self, message: JointState) -> None:
         velocities = velocities_from_message(message, self._config.joints)
-        self._check_jog(message)
-        self.add(JOG_JOINTS, message, lambda: self._jog_joints(velocities))
+        self._add_jog(JOG_JOINTS, message, lambda: self._jog_joints(velocities))
 
     def _jog_joints(self, velocities: Array) -> None:
         config, motion = self._config, self.motion
@@ -324,5 +336,17 @@ class GoalSubscriber:
             self.motion = motion
         motion.command(velocities)
 
-    def _check_jog(self, message: TwistStamped | JointState) -> None:
-        check_stamp(stamp_to_ns(message.header.stamp), self._states.stamp, TIMEOUT, TIMEOUT)
+    def _add_jog(
+        self, topic: Topic, message: TwistStamped | JointState, jog: Callable[[], None]
+    ) -> None:
+        """Call `jog` when it is due, unless the robot was silent until it was too old."""
+        stamp, states, most = stamp_to_ns(message.header.stamp), self._states, TIMEOUT
+        check_stamp(stamp, states.stamp, most, most)
+        came, most = stamp or states.stamp, most + self._config.dt
+
+        def apply() -> None:
+            if abs(states.stamp - came) > 1e9 * most:
+                raise GoalRefused(f"no joint state has come within {TIMEOUT:g} s of it")
+            jog()
+
+        self.add(topic, message, apply)

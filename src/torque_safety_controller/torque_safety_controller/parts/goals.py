@@ -136,6 +136,10 @@ class Goals(Part):
         others = (None,) * len(self.targets.others)
         self.targets = replace(self.targets, pose=None, motion=None, others=others)
 
+    def come_to_rest(self) -> None:
+        """Leave the goals where they are; none moves any more."""
+        self.targets = replace(self.targets, motion=None, v=None, a=None)
+
     def hold(self, pose: pin.SE3) -> None:
         """Make `pose`, where the end effector is, the goal, whatever it was."""
         self.set_pose(pose.copy())
