@@ -245,7 +245,8 @@ def test_the_tool_writes_an_overlay_or_prints_it(recording, call, tmp_path):
     assert (ended.returncode, ended.stderr) == (0, "")
     written = parameters_in(output.read_text())
     # Not the switch: identifying must not change how the robot is controlled.
-    assert set(written) == {f"friction_model_{name}" for name in COEFFICIENTS}
+    assert set(written) == {"joints", *(f"friction_model_{name}" for name in COEFFICIENTS)}
+    assert written["joints"][0] == "panda_joint1"
     for name in COEFFICIENTS:
         found = written[f"friction_model_{name}"]
         np.testing.assert_allclose(found, getattr(TRUTH, name), rtol=0.05)

@@ -99,7 +99,7 @@ def overlay_text(
     notes = [
         f"Friction found by identify_friction in {options.recording.name}, to be passed as a "
         f"parameter file after {options.parameters.name}",
-        f"joints: {', '.join(names)}; {', '.join(dict.fromkeys(_UNITS))}",
+        ", ".join(dict.fromkeys(_UNITS)),
     ]
     notes += [
         f"{name}: {note}" for name, fit in zip(names, fits, strict=True) for note in fit.notes
@@ -109,7 +109,7 @@ def overlay_text(
         f"friction_model_{name}": np.array([float(f"{x:.4g}") for x in getattr(model, name)])
         for name in COEFFICIENTS
     }
-    return overlay(found, notes, NODE)
+    return overlay(names, found, notes, NODE)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

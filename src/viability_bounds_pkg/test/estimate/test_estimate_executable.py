@@ -4,12 +4,18 @@
 import re
 from functools import partial
 
+import numpy as np
 import pytest
 import yaml
 
 from viability_bounds_pkg.cli import limits_file
 from viability_bounds_pkg.cli.estimate_acceleration_limits import main
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
+from viability_bounds_pkg.parameter_files import read_files
+from viability_bounds_pkg.robot.configuration import check_with_urdf
 from viability_bounds_pkg.testing.executables import called, started
+from viability_bounds_pkg.testing.ros_harness import config_folder
 from viability_bounds_pkg.testing.two_joint_robot import LIMIT, ROBOT, parameters_in
 
 MODULE = "viability_bounds_pkg.cli.estimate_acceleration_limits"
@@ -43,13 +49,24 @@ def test_limits_are_written_as_an_overlay(write_robot, call, tmp_path):
     assert (ended.returncode, ended.stderr) == (0, "")
     assert path.read_bytes() == before
     written = parameters_in(output.read_text())
-    assert set(written) == {"acceleration_min", "acceleration_max"}
+    assert set(written) == {"joints", "acceleration_min", "acceleration_max"}
+    assert written["joints"] == ["shoulder", "wrist"]
     controller = yaml.safe_load(output.read_text())["/**/controller_node"]
     assert controller["ros__parameters"] == written
     at_rest = (30.0 - WEIGHT) / INERTIA
     assert 0.6 * at_rest < written["acceleration_max"][0] <= 1.01 * at_rest
     for word in ("shoulder: torque leaves", "worst a_min at q = [", "evaluations"):
         assert word in ended.stdout
+
+
+def test_limits_are_refused_after_the_file_of_another_robot(tmp_path):
+    written, folder = tmp_path / "limits.yaml", config_folder()
+    joints = [f"left_{k}" for k in range(7)]
+    written.write_text(limits_file.overlay(joints, {"acceleration_min": -np.ones(7)}, []))
+    for path in (written, folder / "imperfect" / "baxter_left_arm.yaml"):
+        config = read_files(BoundsConfiguration, [folder / "panda.yaml", path], limits_file.NODE)
+        with pytest.raises(SettingError, match="'left_s?0'; allowed: joints of the URDF"):
+            check_with_urdf(config, config.read_urdf())
 
 
 def test_options_reach_the_limits(write_robot, call):
@@ -193,4 +210,4 @@ def test_what_was_found_is_printed_when_it_cannot_be_written(
     ended = call(write_robot(), "--samples", 100, "-o", tmp_path / "limits.yaml")
     assert "no space left" in one_line(ended)
     found = parameters_in(ended.stdout[ended.stdout.index("/**/bounds_node:") :])
-    assert set(found) == {"acceleration_min", "acceleration_max"}
+    assert set(found) == {"joints", "acceleration_min", "acceleration_max"}

@@ -223,7 +223,7 @@ def overlay_text(limits: AccelerationLimits, drift: Array | None, origin: Sequen
         drift: ``acceleration_drift``, shape (n,), rad/s^3, if it was searched.
         origin: lines of comment that say where the limits come from.
     """
-    notes = [*origin, f"joints: {', '.join(limits.names)}; rad/s^2, drift in rad/s^3"]
+    notes = [*origin, "rad/s^2, drift in rad/s^3"]
     if limits.overridden:
         notes.append(f"set by hand: {', '.join(sorted(limits.overridden))}")
     found = {
@@ -232,7 +232,8 @@ def overlay_text(limits: AccelerationLimits, drift: Array | None, origin: Sequen
     }
     more = {} if drift is None else {"acceleration_drift": rounded(drift, ROUND_UP)}
     # Not for all nodes at once: a file that names the node would win over that.
-    return overlay(found | more, notes) + "\n" + overlay(found, [], CONTROLLER)
+    joints = limits.names
+    return overlay(joints, found | more, notes) + "\n" + overlay(joints, found, [], CONTROLLER)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import tempfile
@@ -72,19 +73,22 @@ def read_robot(path: Path) -> Robot:
     )
 
 
-def overlay(parameters: Mapping[str, Array], notes: Sequence[str], node: str = NODE) -> str:
-    """Return a parameter file that sets `parameters` of one node and nothing else.
+def overlay(
+    joints: Sequence[str], parameters: Mapping[str, Array], notes: Sequence[str], node: str = NODE
+) -> str:
+    """Return a parameter file that sets `parameters` of one node.
 
     It is meant as a second ``--params-file``, after the robot's: what a person wrote there, with
-    the comments, stays as it is.
+    the comments, stays as it is. It names the joints, so that it is refused after another's.
 
     Args:
+        joints: names of the joints.
         parameters: values by name; they must have few enough digits to be written as they are.
         notes: comment lines for the head of the file.
         node: whose parameters they are.
     """
     lines = [f"# {note}" for note in notes]
-    lines += [f"{node}:", "  ros__parameters:"]
+    lines += [f"{node}:", "  ros__parameters:", f"    joints: {json.dumps(list(joints))}"]
     for name, values in parameters.items():
         lines.append(f"    {name}: [{', '.join(repr(float(value)) for value in values)}]")
     return "\n".join(lines) + "\n"
