@@ -78,6 +78,11 @@ class Controller:
         for part in self.parts:
             part.configure(settings)
 
+    def remodel(self) -> None:
+        """Go by a model whose masses have changed from the next step on."""
+        for part in self.parts:
+            part.remodel(self.robot)
+
     def reset(self, q: Array) -> None:
         """Forget the past; the null space is held at `q`, where the arm is, shape (n,), rad."""
         self._a_last = np.zeros(self.robot.n)

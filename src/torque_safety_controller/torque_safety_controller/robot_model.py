@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.robot.description import frame_id
+from viability_bounds_pkg.robot.payload import Payload
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
@@ -74,6 +75,7 @@ class RobotModel(FrameModel):
     Attributes:
         q: position, shape (n,), rad.
         others: the further end effectors.
+        payload: that the masses of the model include.
         M: mass matrix in the middle of the step, shape (n, n), kg m^2.
         h: Coriolis, centrifugal and gravity torques there, shape (n,), N m.
         C: Coriolis matrix there, M' - 2 C skew-symmetric, shape (n, n), N m s; with `rates`.
@@ -91,6 +93,7 @@ class RobotModel(FrameModel):
         super().__init__(model, frame)
         self.others = tuple(FrameModel(model, each) for each in others)
         self.model = model
+        self.payload = Payload(model)
         self.dt = dt
         self.n = model.nv
         self.data = model.createData()

@@ -141,6 +141,9 @@ class Part:
     def reset(self, robot: RobotModel) -> None:
         """Forget the past: the arm may be elsewhere. `robot` is updated to its state."""
 
+    def remodel(self, robot: RobotModel) -> None:
+        """Go by a model whose masses have changed from the next step on."""
+
     def prepare(self, step: Step) -> None:
         """Add tasks, rows, torque or forces to a step, or narrow its bounds."""
 
@@ -203,6 +206,18 @@ def joints_beyond(model: pin.Model, torque: Array, most: Array) -> str:
         for name, needed, limit in zip(names, np.abs(torque), most, strict=True)
         if needed > limit
     )
+
+
+def too_weak_at(model: pin.Model, q: Array, most: Array) -> str:
+    """Return which joints cannot hold the arm at `q`, in words; empty for none.
+
+    Args:
+        model: of the arm.
+        q: positions, shape (n,), rad.
+        most: torque that there is, shape (n,), N m.
+    """
+    torque = pin.computeGeneralizedGravity(model, model.createData(), q)
+    return joints_beyond(model, torque, most)
 
 
 def joints_named(robot: RobotModel, flags: NDArray[np.bool_]) -> str:

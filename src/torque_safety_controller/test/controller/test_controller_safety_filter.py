@@ -3,6 +3,7 @@
 
 import controllers
 import numpy as np
+import pinocchio as pin
 import pytest
 from arms import load_arm
 from controllers import posture_only
@@ -10,6 +11,7 @@ from controllers import posture_only
 from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.robot.description import frame_id
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.viability import BoundsSolver
@@ -42,6 +44,28 @@ def make_filter(arm=ARM, limits=LIMITS, share=1.0, **reserve) -> SafetyFilter:
 def make(filtered=True):
     parts = [make_filter()] if filtered else []
     return controllers.make(ARM, *parts, gains=posture_only(100.0, 20.0))
+
+
+def test_a_load_is_known_to_the_plans_as_if_it_were_a_part_of_the_arm():
+    """One that the model gets while the controller runs, and one that it has from the start."""
+    mass, centre, moments = 1.0, np.array([0.0, 0.0, 0.1]), 1e-3 * np.eye(3)
+    link = ARM.model.frames[frame_id(ARM.model, ARM.frame)]
+    loaded, late = ARM.model.copy(), ARM.model.copy()
+    loaded.appendBodyToJoint(link.parentJoint, pin.Inertia(mass, centre, moments), link.placement)
+    told = []
+    for model in (loaded, late):
+        arm = ARM._replace(model=model)
+        keeper = make_filter(arm)
+        controller = controllers.make(arm, keeper, gains=posture_only(100.0, 20.0))
+        if model is late:
+            controller.robot.payload.carry(ARM.frame, mass, centre, moments)
+            controller.remodel()
+        controller.reset(EDGE)
+        controller.goals.set_posture(EDGE)
+        for v in (ZERO, 0.1 * arm.v_max):
+            step = controller.step(State(EDGE, v), LIMITS)
+            told.append([*step.tau, keeper.slack, *keeper.rest_torque])
+    np.testing.assert_allclose(told[2:], told[:2], atol=1e-6)  # N m
 
 
 # Motions

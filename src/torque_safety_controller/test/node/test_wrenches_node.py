@@ -122,6 +122,23 @@ def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
     assert hand.reported("compliance") == "sensor silent"
 
 
+def test_the_weight_of_a_load_beyond_the_sensor_is_not_felt():
+    controller = controller_of(VALUES)
+    sensor, robot = controller.find(Interaction).sensor, controller.robot
+    controller.reset(ARM.q_start)
+    robot.payload.carry("panda_hand", 2.0, [0.0, 0.0, 0.1], np.zeros((3, 3)))
+    controller.remodel()
+    at_sensor = robot.model.frames[robot.model.getFrameId("panda_link8")].placement.actInv(
+        robot.model.frames[robot.model.getFrameId("panda_hand")].placement
+    )
+    turn = robot.pose.rotation @ at_sensor.rotation.T
+    force = 2.0 * turn.T @ robot.model.gravity.linear
+    lever = at_sensor.act(np.array([0.0, 0.0, 0.1]))
+    sensor.receive(WEIGHT + np.r_[force, np.cross(lever, force)])
+    sensor.update(robot.pose.rotation, 1.0)
+    np.testing.assert_allclose(sensor.wrench, 0.0, atol=1e-9)
+
+
 def test_targets_that_cannot_be_exerted_are_refused_and_others_are_exerted(ros):
     """In contact with what gives exactly that back, the motors carry it."""
     hand = WrenchChain(ros, yield_threshold=[])

@@ -242,7 +242,7 @@ def _interaction(
         allowed = f"a link of the URDF ({error})"
         raise SettingError("ft_frame", settings.ft_frame, allowed) from error
     at_hand = hand.placement.actInv(frame.placement)
-    sensor = WrenchSensor(at_hand, tool, model.gravity.linear)
+    sensor = WrenchSensor(at_hand, tool, model.gravity.linear, frame=settings.ft_frame)
     return Interaction(goals, sensor, contact, placement, settings.settings)
 
 

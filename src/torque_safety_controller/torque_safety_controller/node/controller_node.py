@@ -30,12 +30,14 @@ from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.contact.interaction import Interaction
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.step import too_weak_at
 from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.node.bounds_parameters import make_plausibility_check
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
 from viability_bounds_pkg.ros.messages import Arrival
 from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.payload import PayloadSubscriber
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.runtime import steady_timer
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS
@@ -79,6 +81,7 @@ class ControllerNode(ArmNode):
         self._wrenches = WrenchSubscriber(
             self, self._controller.find(Interaction), self._goals, config, base
         )
+        self._payload = PayloadSubscriber(self, self._controller.robot.payload, self._on_payload)
         self._supervisor = Supervisor(
             config.dt,
             config.start_control,
@@ -102,6 +105,7 @@ class ControllerNode(ArmNode):
                 "states_refused": self._states.refused,
                 "limits_refused": self._limits.refused,
                 "wrenches_refused": self._wrenches.refused,
+                "payload_refused": self._payload.refused,
             },
             self._goals,
         )
@@ -130,6 +134,15 @@ class ControllerNode(ArmNode):
     def _configure(self, config: ControllerConfiguration) -> None:
         self._config = config
         self._controller.configure(config.settings)
+
+    def _on_payload(self) -> None:
+        controller, states = self._controller, self._states
+        controller.remodel()
+        self.get_logger().info(f"payload: {controller.robot.payload}")
+        if states.message is None:  # nobody knows where the arm stands
+            return
+        if weak := too_weak_at(controller.robot.model, states.q, controller.tau_max):
+            self.get_logger().warning(f"payload: too heavy where the arm stands: {weak}")
 
     # Streams
 

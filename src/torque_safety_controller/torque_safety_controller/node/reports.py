@@ -133,6 +133,7 @@ class ControllerReport:
             "latency_p50_us": 1e6 * self._latencies.percentile(50),
             "latency_p99_us": 1e6 * self._latencies.percentile(99),
             "goals_pending": len(self._goals),
+            "payload": str(self._controller.robot.payload),
         }
         for more in (self._fixed, self._refused, self._supervisor.values()):
             values |= more

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.settings import Settings
-from torque_safety_controller.step import Part, Step, joints_beyond
+from torque_safety_controller.step import Part, Step, too_weak_at
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.pose_task import (
     PoseMotion,
@@ -169,6 +169,10 @@ class Goals(Part):
         """Keep the goals; where the arm is, the null space is held."""
         self.posture = robot.q.copy()
 
+    def remodel(self, robot: RobotModel) -> None:
+        """Look again whether the arm can be held at its goal."""
+        self._made_of = (None,) * 4
+
     def prepare(self, step: Step) -> None:
         """Add the tasks of the goals, or damping without any."""
         step.tracking = step.order.track and self.any
@@ -188,8 +192,7 @@ class Goals(Part):
         robot, goals = step.robot, self.targets
         if goals.q is None or goals.pose is not None or goals.v is not None:
             return ""
-        torque = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), goals.q)
-        heavy = joints_beyond(robot.model, torque, step.tau_max)
+        heavy = too_weak_at(robot.model, goals.q, step.tau_max)
         return heavy and f"the goal cannot be held: {heavy}"
 
     def tasks(self, stiffness: Array | None) -> list[Task]:

@@ -6,11 +6,13 @@ import math
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import InertiaStamped
 from sensor_msgs.msg import JointState
 from true_arm import model
 
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
-from viability_bounds_pkg.ros.runtime import stamp_to_ns
+from viability_bounds_pkg.robot.payload import Payload
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, stamp_to_ns
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 from viability_bounds_pkg.state_estimation.observer import design_observer
@@ -72,11 +74,11 @@ class EstimatorProbe:
         return self.ros.reported(NODE, key)
 
 
-def reference(delay=0, lag=0.0, coarse=True):
+def reference(delay=0, lag=0.0, coarse=True, arm=None):
     """Return the estimator that a node should have."""
     design = design_observer(DT, np.full(N, 1e-4 * coarse), np.full(N, 5.0 * coarse))
     return StateEstimator(
-        model(),
+        arm or model(),
         DT,
         delay,
         np.full(N, lag),
@@ -104,6 +106,23 @@ def test_answers_are_those_of_the_estimator_with_stamp_and_effort_of_the_state(r
     # A repeated state gets the same answer and is no step.
     np.testing.assert_array_equal(arm.state(12, q, v, tau), got)
     ros.wait_until(lambda: arm.reported("states_answered") == "12")
+
+
+def test_a_load_counts_in_the_prediction(ros):
+    arm = EstimatorProbe(ros, delay=2, **COARSE)
+    message = InertiaStamped()
+    message.header.frame_id, message.inertia.m = "panda_hand", 2.0
+    ros.talk(InertiaStamped, "payload", GOAL_QOS).publish(message)
+    ros.wait_until(lambda: arm.reported("payload") == "2.00 kg at panda_hand", "the load")
+    loaded = model().copy()
+    Payload(loaded).carry("panda_hand", 2.0, np.zeros(3), np.zeros((3, 3)))
+    ours = reference(2, arm=loaded)
+    for k in range(1, 6):
+        np.testing.assert_allclose(
+            arm.state(k, tau=TAU), ours.step(k * PERIOD, State(HOME, STILL), TAU), atol=1e-12
+        )
+        arm.command(k, TAU)
+        ours.answer(k * PERIOD, TAU)
 
 
 def test_states_without_velocities_are_answered_with_those_estimated(ros):

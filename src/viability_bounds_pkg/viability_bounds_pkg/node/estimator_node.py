@@ -21,6 +21,7 @@ from viability_bounds_pkg.robot.configuration import (
     LimitedRobotConfiguration,
     load_model,
 )
+from viability_bounds_pkg.robot.payload import Payload
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
 from viability_bounds_pkg.ros.messages import (
@@ -31,6 +32,7 @@ from viability_bounds_pkg.ros.messages import (
     TorqueCommand,
 )
 from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.payload import PayloadSubscriber
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
@@ -114,6 +116,7 @@ class EstimatorNode(ArmNode):
         self._estimates = self.stream(ESTIMATED_JOINT_STATES)
         self.listen(JOINT_STATES, self._on_state)
         self.listen(JOINT_COMMANDS, self._on_command)
+        self._payload = PayloadSubscriber(self, Payload(model))
         self._diagnostics = Diagnostics(self, self._report, self.publisher_watch)
         source = "estimated" if config.velocity_estimation else "as reported"
         lag = 1e3 * config.declared.motor_lag
@@ -168,6 +171,8 @@ class EstimatorNode(ArmNode):
             "states_refused": reader.refused,
             "commands_heard": self.commands_heard,
             "commands_refused": self._refused,
+            "payload": str(self._payload.payload),
+            "payload_refused": self._payload.refused,
             "resets": estimator.resets,
             "age_s": time.monotonic() - reader.heard_at,
         }

@@ -217,8 +217,8 @@ def _of_inertial(link: Element) -> Iterator[str]:
         yield f"has an <inertia> without {', '.join(lacking)}"
         return
     moments = _moments(given)
-    if moments[0] < -_slack(moments):
-        yield f"has a negative moment of inertia: {_shown(moments)}"
+    if moments[0] < -moments_slack(moments):
+        yield f"has a negative moment of inertia: {shown_moments(moments)}"
 
 
 def _odd_moments(link: Element) -> str:
@@ -227,11 +227,11 @@ def _odd_moments(link: Element) -> str:
     if inertia is None or any(_of_inertial(link)):
         return ""
     moments = _moments(inertia.attrib)
-    if moments[2] <= moments[0] + moments[1] + _slack(moments):
+    if moments[2] <= moments[0] + moments[1] + moments_slack(moments):
         return ""
     return (
-        f"has moments of inertia that no body has: {_shown(moments)}, of which none can be above "
-        "the sum of the others"
+        f"has moments of inertia that no body has: {shown_moments(moments)}, of which none can be "
+        "above the sum of the others"
     )
 
 
@@ -243,9 +243,11 @@ def _moments(given: Mapping[str, str]) -> NDArray[np.float64]:
     return moments
 
 
-def _slack(moments: NDArray[np.float64]) -> float:
+def moments_slack(moments: NDArray[np.float64]) -> float:
+    """Return by how much moments of inertia in order, shape (3,), may be impossible, kg m^2."""
     return _ROUNDING * float(np.abs(moments).max()) + _SMALLEST
 
 
-def _shown(moments: NDArray[np.float64]) -> str:
+def shown_moments(moments: NDArray[np.float64]) -> str:
+    """Return moments of inertia, shape (3,), kg m^2, in words."""
     return f"about its main axes {', '.join(f'{each:.3g}' for each in moments)} kg m^2"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import InertiaStamped, WrenchStamped
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -19,7 +19,13 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS, NEWEST_QOS, STATUS_QOS
+from viability_bounds_pkg.ros.runtime import (
+    CONTROL_QOS,
+    GOAL_QOS,
+    LATCHED_QOS,
+    NEWEST_QOS,
+    STATUS_QOS,
+)
 
 USER = "user"
 """Stands for nodes of others."""
@@ -143,6 +149,15 @@ FT_WRENCH = Topic(
     "what the wrist sensor measures, tool and bias included, in the axes of `ft_frame`, N and N"
     " m; positive acts on the arm; a stamp that is repeated is no measurement",
 )
+PAYLOAD = Topic(
+    "payload",
+    InertiaStamped,
+    GOAL_QOS,
+    (USER,),
+    ("controller_node", "estimator_node"),
+    "what the arm carries from now on besides its own links: mass, kg, centre, m, and moments "
+    "about it, kg m², in the axes of the link `frame_id`; a mass of 0: nothing",
+)
 LIMIT_DISTANCES = Topic(
     "limit_distances",
     JointState,
@@ -198,6 +213,7 @@ SHARED_TOPICS = (
     ACCELERATION_LIMITS,
     JOINT_COMMANDS,
     FT_WRENCH,
+    PAYLOAD,
     LIMIT_DISTANCES,
     SLOW_JOINT_STATES,
     SLOW_ACCELERATION_LIMITS,

@@ -159,6 +159,11 @@ class Interaction(Part):
         """Forget the past and the target."""
         self._clear()
 
+    def remodel(self, robot: RobotModel) -> None:
+        """Have the sensor feel what the hand carries."""
+        if self.sensor.frame:
+            self.sensor.carry(robot.payload.beyond(self.sensor.frame))
+
     def prepare(self, step: Step) -> None:
         """Add the admittance task, (27), and what the contact may exert."""
         self._change_state(step.robot, step.elapsed)

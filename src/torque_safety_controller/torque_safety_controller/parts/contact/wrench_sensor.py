@@ -48,9 +48,10 @@ class WrenchSensor:
         gravity: in the URDF's root frame, shape (3,), m/s^2.
         filter_hz: cut-off frequency of the filter, Hz.
         timeout: how long without a measurement before the sensor counts as silent, s.
+        frame: name of the sensor's frame; empty where no load is to be expected.
 
     Attributes:
-        placement: as given.
+        placement, frame: as given.
         bias: of the sensor, in its axes, shape (6,), N and N m; see `tare`.
         wrench: of the environment on the arm, about the end effector's origin and in its axes,
             shape (6,), N and N m; zero while the sensor is silent.
@@ -65,16 +66,23 @@ class WrenchSensor:
         gravity: ArrayLike,
         filter_hz: float = FILTER_HZ,
         timeout: float = TIMEOUT,
+        frame: str = "",
     ) -> None:
         self._cut_off, self._timeout = 2.0 * math.pi * filter_hz, timeout
-        self.placement = placement
+        self.placement, self.frame = placement, frame
         self.bias = np.zeros(6)
         self._action = np.ascontiguousarray(placement.toDualActionMatrix())
-        # From gravity in the end effector's axes to the wrench of the tool's weight.
-        R = tool.mass * placement.rotation.T
-        self._weight = np.vstack([R, pin.skew(tool.lever) @ R])  # shape (6, 3)
+        self._tool = tool
+        self.carry(pin.Inertia.Zero())
         self._gravity = np.asarray(gravity, dtype=np.float64)
         self.start()
+
+    def carry(self, load: pin.Inertia) -> None:
+        """Feel a load besides the tool from now on, in the sensor's axes."""
+        beyond = self._tool + load
+        # From gravity in the end effector's axes to the wrench of the weight.
+        R = beyond.mass * self.placement.rotation.T
+        self._weight = np.vstack([R, pin.skew(beyond.lever) @ R])  # shape (6, 3)
 
     def start(self) -> None:
         """Forget what was measured; the bias stays."""

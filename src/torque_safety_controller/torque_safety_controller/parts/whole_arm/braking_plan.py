@@ -253,8 +253,12 @@ class PlanTorques:
     """
 
     def __init__(self, model: pin.Model, limits: PlanLimits, usable: Array) -> None:
-        self._pool = pin.ModelPool(model, 1)
         self._limits, self._usable = limits, usable
+        self.remodel(model)
+
+    def remodel(self, model: pin.Model) -> None:
+        """Go by the masses of `model` as they are now; a pool has copies of them."""
+        self._pool = pin.ModelPool(model, 1)
 
     def evaluate(self, q: Array, v: Array, periods: Array, extra: Array) -> BrakingPlans:
         """Return the plans in which joints stand after `periods`.

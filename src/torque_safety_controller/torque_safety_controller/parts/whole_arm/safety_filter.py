@@ -170,6 +170,10 @@ class SafetyFilter(Part):
         self._turn = 0
         self.outcomes.clear()
 
+    def remodel(self, robot: RobotModel) -> None:
+        """See `Part.remodel`; the plan in hand is looked at again in the next step."""
+        self._plans.remodel(robot.model)
+
     def forget_plan(self) -> None:
         """Begin with a new plan in the next step."""
         self._time, self._periods = USUAL_TIME, None
