@@ -16,7 +16,7 @@ from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
@@ -24,7 +24,7 @@ from sim_bridge.bullet.sensor import ForceTorqueReading
 from sim_bridge.hardware import Sensing
 from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot, make_stop
 from sim_bridge.node.commands import CommandStream
-from sim_bridge.node.topics import CLOCK, PAUSE, RESET
+from sim_bridge.node.topics import CLOCK, PAUSE, RECORDED, RESET
 from sim_bridge.node.world_subscriber import WorldSubscriber
 from viability_bounds_pkg.plausible import RESTART_GAP
 from viability_bounds_pkg.recent_values import RecentValues
@@ -34,7 +34,7 @@ from viability_bounds_pkg.ros.messages import PositionCommand, TorqueCommand, wr
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.robot_urdf import warn_of_unusual
-from viability_bounds_pkg.ros.runtime import set_stamp, steady_timer
+from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns, steady_timer
 from viability_bounds_pkg.ros.topics import (
     FT_WRENCH,
     JOINT_COMMANDS,
@@ -46,6 +46,9 @@ Array = NDArray[np.float64]
 
 RETRY_PERIOD = 0.03
 """Twice it is shorter than the 75 ms after which a controller counts the robot as silent, s."""
+
+AHEAD = 20
+"""Periods that a robot in lockstep goes on without its recorder; a socket's buffer keeps more."""
 
 _CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
 
@@ -63,7 +66,8 @@ class BulletNode(ArmNode):
     last command is held, and after ``command_timeout`` periods the robot stops itself. Where
     acceleration limits are given, both keep all limits, and commands that return get their effect
     back gradually; where not, the brakes stop it. With ``clock:
-    lockstep`` a period ends when the command with its stamp has come, without a limit of time.
+    lockstep`` a period ends when the command with its stamp has come, without a limit of time;
+    likewise the robot waits for a recorder that tells what it has, so that no state is lost.
 
     The robot's brakes are on until the first command.
 
@@ -123,6 +127,8 @@ class BulletNode(ArmNode):
         description = ROBOT_DESCRIPTION.publisher(self)
         description.publish(String(data=config.urdf))
         self.listen(JOINT_COMMANDS, self._on_command)
+        if config.lockstep:
+            RECORDED.subscription(self, self._on_recorded)
         RESET.serve(self, self._on_reset)
         PAUSE.serve(self, self._on_pause)
         if not config.lockstep:
@@ -151,6 +157,7 @@ class BulletNode(ArmNode):
         self._period_errors = RecentValues()
         self._ticked_at, self._late = math.nan, 0
         self._started_at, self._played = time.monotonic(), 0
+        self._recorded: float = math.inf  # stamp, ns; no recorder has told one yet
 
     def _plan_pause(self) -> None:
         """Compute the period at which to pause, `pause_after` from now."""
@@ -243,7 +250,7 @@ class BulletNode(ArmNode):
 
     def _retry(self) -> None:
         """Publish the state again: it may have been lost, or there was no subscriber yet."""
-        waiting = self._paused or (self._config.lockstep and not self._advanced)
+        waiting = self._paused or self._config.lockstep
         if waiting and time.monotonic() - self._published_at > RETRY_PERIOD:
             if self._ft_publisher is not None:
                 self._ft_publisher.publish(self._ft_wrench)
@@ -253,13 +260,28 @@ class BulletNode(ArmNode):
 
     def _on_command(self, message: JointState) -> None:
         if not self._commands.accept(
-            message, self._stamp, self._published_at, ended=self._advanced, paused=self._paused
+            message,
+            self._stamp,
+            self._published_at,
+            ended=self._advanced,
+            paused=self._paused or self._awaits_recorder(),
         ):
             return
         self._advance()
         # After a pause by itself the next state is not published: time stops for all nodes.
-        if self._config.lockstep and not self._paused:
+        if self._config.lockstep and not self._paused and not self._awaits_recorder():
             self._next_state()
+
+    def _on_recorded(self, message: Header) -> None:
+        waited = self._awaits_recorder()
+        self._recorded = stamp_to_ns(message.stamp)
+        if waited and not self._awaits_recorder():
+            self._next_state()
+
+    def _awaits_recorder(self) -> bool:
+        """Return whether the next period does not begin until states of before are recorded."""
+        ahead = self._stamp - self._recorded
+        return self._advanced and not self._paused and ahead >= AHEAD * self._dt_ns
 
     # Services
 
@@ -341,6 +363,8 @@ class BulletNode(ArmNode):
             return DiagnosticStatus.ERROR, "a limit was broken", values
         if self._paused:
             return DiagnosticStatus.OK, "paused", values
+        if self._awaits_recorder():
+            return DiagnosticStatus.OK, "waiting for the recorder", values
         if commands.acting is None:
             doing = "braking" if control == "brakes" else control
             return DiagnosticStatus.WARN, f"{doing}: no commands", values

@@ -18,7 +18,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 
 from sim_bridge.mcap_file import McapFile
-from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES
+from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES, RECORDED
 from sim_bridge.scenario.report import Array, RecordedRun
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
@@ -34,6 +34,9 @@ from viability_bounds_pkg.ros.topics import (
 )
 
 _RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+_TOLD_EACH = 5
+"""States after which the robot is told that they are recorded."""
 
 _MANY = QoSProfile(depth=100)
 _FURTHER: tuple[tuple[str, type, QoSProfile], ...] = (
@@ -59,6 +62,8 @@ def _stamp_of(serialized: bytes) -> int:
 
 class RunRecorder:
     """Records the messages of robot, bounds and controller by their stamps, in any order.
+
+    It tells a robot in lockstep what it has, which therefore waits for it.
 
     Args:
         node: subscribes.
@@ -92,6 +97,7 @@ class RunRecorder:
         self._limits: dict[int, list[Sequence[float]]] = {}
         self._torques: dict[int, Sequence[float]] = {}
         self._wrenches: dict[int, Sequence[float]] = {}
+        self._recorded = RECORDED.publisher(node)
         for topic, callback in (
             (JOINT_STATES, self._on_state),
             (ACCELERATION_LIMITS, self._on_limits),
@@ -141,11 +147,11 @@ class RunRecorder:
 
         node.create_subscription(kind, name, keep, qos, raw=True)
 
-    def run(self, first: int) -> RecordedRun:
-        """Return the recording from the state with stamp `first` on."""
-        stamps = sorted(stamp for stamp in self._states if stamp >= first)
+    def run(self, first: int, period: int, periods: int) -> RecordedRun:
+        """Return the recording of a number of periods, ns, from the stamp `first` on."""
+        stamps = [first + k * period for k in range(periods)]
         nan = [np.nan] * len(self._joints)
-        states = np.array([self._states[s] for s in stamps])
+        states = np.array([self._states.get(s, (nan, nan)) for s in stamps])
         limits = np.array([self._limits.get(s, (nan, nan)) for s in stamps])
         return RecordedRun(
             joints=self._joints,
@@ -160,9 +166,14 @@ class RunRecorder:
         )
 
     def _on_state(self, message: JointState) -> None:
-        if self._reader.read(message, time.monotonic()) is Arrival.NEW:
+        arrival = self._reader.read(message, time.monotonic())
+        if arrival is Arrival.REFUSED:
+            return
+        if arrival is Arrival.NEW:
             self.stamp, self.q = self._reader.stamp, self._reader.q
             self._states[self.stamp] = self.q, self._reader.v
+        if arrival is Arrival.REPEATED or len(self._states) % _TOLD_EACH == 0:
+            self._recorded.publish(message.header)
 
     def _on_limits(self, message: JointTrajectory) -> None:
         limits = [point.accelerations for point in message.points]

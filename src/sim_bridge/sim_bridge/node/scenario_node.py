@@ -115,7 +115,7 @@ class ScenarioNode(ArmNode):
 
     def recorded_run(self) -> RecordedRun:
         """Return the recording since the robot began to move."""
-        return self.recorder.run(self._first)
+        return self.recorder.run(self._first, self._period, int(self.robot["periods"]))
 
     # Course of the scenario
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from geometry_msgs.msg import WrenchStamped
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, NEWEST_QOS
 from viability_bounds_pkg.ros.topics import USER, OfferedService, Topic
 
 _NODE = "bullet_node"
@@ -37,7 +38,16 @@ CLOCK = Topic(
     (USER,),
     "robot time; only with `publish_clock`",
 )
-TOPICS = (OBSTACLES, EXTERNAL_WRENCH, CLOCK)
+RECORDED = Topic(
+    "recorded",
+    Header,
+    NEWEST_QOS,
+    ("scenario_node",),
+    (_NODE,),
+    "stamp of a state that is recorded; in lockstep the robot begins no period that is more than "
+    "20 later",
+)
+TOPICS = (OBSTACLES, EXTERNAL_WRENCH, CLOCK, RECORDED)
 
 RESET = OfferedService(
     "reset", Trigger, _NODE, "puts the robot at its start configuration, at rest"

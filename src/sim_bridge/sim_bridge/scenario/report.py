@@ -30,11 +30,11 @@ _RECORDED = ("t", "q", "v", "a_lower", "a_upper", "tau", "ft_wrench")
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """A recorded run; arrays of N control periods by n joints, NaN where a message was lost.
+    """A recorded run; arrays of all N control periods by n joints, NaN where a message was lost.
 
     Attributes:
         joints: names, n of them.
-        t: shape (N,), s of robot time from the first recorded state.
+        t: shape (N,), s of robot time from the first state.
         q, v: position and velocity, rad and rad/s.
         a_lower, a_upper: acceleration limits, rad/s^2.
         tau: commanded torque, N m; NaN under position control too.
@@ -55,8 +55,9 @@ class RecordedRun:
 
     @property
     def lost(self) -> int:
-        """Number of periods without recorded limits or command."""
-        return int((np.isnan(self.a_lower[:, 0]) | ~self.answered).sum())
+        """Number of periods without recorded state, limits or command."""
+        without = np.isnan(self.q[:, 0]) | np.isnan(self.a_lower[:, 0]) | ~self.answered
+        return int(without.sum())
 
 
 def write_report(
@@ -142,7 +143,7 @@ def _errors(config: ScenarioConfiguration, run: RecordedRun, reference: Array) -
         BulletRobot(config.urdf, config.joints, locked_positions=config.locked, physics_dt=1e-3)
     ) as robot:
         base = robot.link_pose(config.base_frame)
-        for i in np.flatnonzero(np.isfinite(reference[:, 0])):
+        for i in np.flatnonzero(np.isfinite(reference[:, 0]) & np.isfinite(run.q[:, 0])):
             robot.reset(run.q[i], rest)
             pose = robot.link_pose(config.end_effectors[0])
             desired = base * pin.XYZQUATToSE3(reference[i])
@@ -218,7 +219,7 @@ def _metrics(
                 units_of(config.urdf, run.joints),
                 _floats(robot, "lower_clearance_rad").tolist(),
                 _floats(robot, "upper_clearance_rad").tolist(),
-                (np.abs(run.v).max(axis=0) / config.velocity_max).tolist(),
+                (np.fmax.reduce(np.abs(run.v)) / config.velocity_max).tolist(),
                 _floats(robot, "torque_ratio").tolist(),
                 strict=True,
             )
@@ -297,6 +298,8 @@ def verdict(metrics: Metrics) -> str:
             ": the promise needs a command in every period (give the nodes their own cores, or "
             "lower rate_hz)"
         )
+    if lost := metrics["recording_lost_periods"]:
+        said += f"; the recording lacks messages of {lost} of {steps} periods"
     if metrics["torque_rates_clipped"]:
         said += "; torque_rate_max is clipped: limits are not promised with it"
     return said + "."
@@ -319,7 +322,7 @@ def _draw(
         f"{metrics['clock']}: {outcome}"
     )
     low, high = config.position_min, config.position_max
-    j = int(np.argmin(np.minimum(run.q - low, high - run.q).min(axis=0)))
+    j = int(np.argmin(np.fmin.reduce(np.minimum(run.q - low, high - run.q))))
     of_joint = units_of(config.urdf, run.joints)[j]
     force = "N m" if of_joint == "rad" else "N"
     for (left, right), (name, unit, values, lower, upper) in zip(

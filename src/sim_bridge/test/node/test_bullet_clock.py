@@ -5,6 +5,10 @@ import time
 
 import numpy as np
 from robot_probe import BRAKES, PERIOD, Q, RobotProbe
+from std_msgs.msg import Header
+
+from sim_bridge.node.bullet_node import AHEAD
+from viability_bounds_pkg.ros.runtime import NEWEST_QOS, set_stamp
 
 
 def test_an_unanswered_state_is_sent_again_and_nothing_moves(ros):
@@ -53,6 +57,25 @@ def test_it_pauses_itself_after_the_time_asked_for(ros):
         each=lambda: robot.send(robot.stamp, robot.gravity()),
     )
     robot.await_reported("paused", "True")
+
+
+def test_in_lockstep_it_waits_for_its_recorder(ros):
+    robot, header = RobotProbe(ros), Header()
+    recorder = ros.talk(Header, "recorded", NEWEST_QOS)
+    robot.step()
+    for recorded in (robot.stamp, robot.stamp + 5 * PERIOD):
+        last = str(recorded + AHEAD * PERIOD)
+        set_stamp(header.stamp, recorded)
+        recorder.publish(header)
+        ros.wait_until(
+            lambda end=last: (
+                robot.reported("message") == "waiting for the recorder"
+                and robot.reported("stamp_ns") == end
+            ),
+            each=lambda: robot.send(robot.stamp, robot.gravity()),
+        )
+    robot.reset()  # the recorder was killed
+    robot.step(times=AHEAD + 2)
 
 
 def test_in_real_time_it_moves_by_itself_and_brakes_without_commands(ros):

@@ -2,12 +2,16 @@
 import signal
 import subprocess
 
+import numpy as np
 import yaml
 from ament_index_python.packages import get_package_prefix
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 
 from sim_bridge.node import scenario_node
+from viability_bounds_pkg.ros.runtime import NEWEST_QOS
 from viability_bounds_pkg.testing.executables import as_child, called
-from viability_bounds_pkg.testing.ros_harness import config_folder
+from viability_bounds_pkg.testing.ros_harness import config_folder, joint_state, read_config
 
 DEADLINE = 60.0  # s
 
@@ -54,3 +58,22 @@ def test_told_to_stop_it_judges_nothing(tmp_path):
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
     assert not (tmp_path / "out").exists()
+
+
+def test_a_recording_has_a_row_for_each_period_and_tells_the_robot_what_it_has(ros, tmp_path):
+    arguments(tmp_path)
+    values = read_config("panda", "scenario_node")
+    values["scenario"] = str(tmp_path / "scenario.yaml")
+    recorder = ros.start(scenario_node.ScenarioNode, values).recorder
+    told, states = ros.listen(Header, "recorded", NEWEST_QOS), ros.talk(JointState, "joint_states")
+    rest = np.zeros(7)
+    for stamp in (10, 20, 40):  # ns
+        state = joint_state(values["joints"], stamp, rest + stamp, rest)
+        ros.wait_until(
+            lambda s=stamp: told and told[-1].stamp.nanosec == s,
+            each=lambda s=state: states.publish(s),
+        )
+    run = recorder.run(10, period=10, periods=5)
+    np.testing.assert_allclose(run.t, 1e-9 * np.array([0, 10, 20, 30, 40]))
+    np.testing.assert_array_equal(run.q[:, 0], [10, 20, np.nan, 40, np.nan])
+    assert run.lost == 5  # there are no limits either

@@ -12,6 +12,7 @@ KEPT = {
     "deadline_misses": 0,
     "late_periods": 0,
     "braked_periods": 0,
+    "recording_lost_periods": 0,
     "max_position_violation_rad": 0.0,
     "max_velocity_violation_rad_s": 0.0,
     "max_torque_ratio": 0.9,
@@ -40,6 +41,7 @@ REASON = "the promise needs a command in every period"
         (BROKEN | {"max_velocity_violation_rad_s": 0.5}, "speed by 0.5 rad/s", "torque"),
         (BROKEN | SLIDE, "position by 0.02 m (left_e1); speed by 0.5 m/s.", "rad"),
         ({"limits_kept": False, "max_torque_ratio": 1.2}, "torque, 1.2 of its limit", "position"),
+        ({"recording_lost_periods": 9}, "recording lacks messages of 9 of 6145 periods", REASON),
         ({"torque_rates_clipped": True}, "limits are not promised", REASON),
     ],
 )
