@@ -158,6 +158,9 @@ def test_recordings_of_another_robot_are_refused(recording):
 
 
 JOINTS = ("shoulder", "elbow")
+PHASE = 0.01 * np.arange(1000)[:, None]  # of a motion at 1 Hz
+T = np.arange(1000.0)
+TURNING, SPEED = np.sin(PHASE) * [1.0, 0.0], 0.01 * np.cos(PHASE) * [1.0, 0.0]
 
 
 def arrays(count=200):
@@ -188,12 +191,22 @@ def loaded(tmp_path, contents):
         ({"tau": np.full((200, 2), math.nan)}, "'tau' has numbers that are not finite"),
         ({"tau": np.full((200, 2), "x")}, "no NumPy file of arrays of numbers"),
         ({"joints": np.array(["shoulder", "wrist"])}, "joint 'elbow' is missing"),
+        ({"t": T, "tau": TURNING, "q": TURNING, "v": np.degrees(SPEED)}, "'v' of shoulder dif"),
+        ({"t": T, "tau": TURNING, "q": TURNING, "v": 0.0 * SPEED}, "differs by 100%"),
     ],
 )
 def test_what_cannot_be_used_is_named(tmp_path, changed, message):
     contents = {key: value for key, value in (arrays() | changed).items() if value is not None}
     with pytest.raises(RecordingError, match=message):
         loaded(tmp_path, contents)
+
+
+def test_angles_in_degrees_are_refused(recording, call, tmp_path):
+    columns = {key: np.degrees(getattr(recording, key)) for key in ("q", "v")}
+    run = save(tmp_path / "run.npz", Recording(recording.t, **columns, tau=recording.tau))
+    ended = call(run)
+    assert ended.returncode == 1
+    assert "beyond its limits by more than its range: degrees, or another robot?" in ended.stderr
 
 
 def test_blocks_are_averages():

@@ -22,6 +22,10 @@ Array = NDArray[np.float64]
 
 KEYS = ("t", "q", "v", "tau")
 
+_PIECE = 0.1  # s; noise averages out over it
+_MOVED = 0.05  # rad; range of a joint from which positions tell a velocity
+_RATE_ERROR = 0.5  # of the motion, that filters and noise explain
+
 
 class RecordingError(ArmSafetyError, ValueError):
     """A recording that cannot be read or used."""
@@ -74,7 +78,8 @@ def load_recording(path: Path, joints: Sequence[str]) -> Recording:
         joints: names of the joints wanted, in the order wanted; the file may have more.
 
     Raises:
-        RecordingError: the file cannot be read, lacks an array or a joint, or `Recording` refuses.
+        RecordingError: the file cannot be read, lacks an array or a joint, or `Recording` refuses;
+            or velocities are not those of the positions: of other units, or other joints.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -90,13 +95,34 @@ def load_recording(path: Path, joints: Sequence[str]) -> Recording:
                     f"{arrays[key].shape}"
                 )
             arrays[key] = arrays[key][:, [names.index(joint) for joint in joints]]
-        return Recording(**arrays)
+        recording = Recording(**arrays)
+        _check_rates(recording, joints)
+        return recording
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
     except KeyError as error:
         raise RecordingError(f"{path}: array missing: {error}") from error
     except (OSError, TypeError, ValueError, EOFError, BadZipFile) as error:
         raise RecordingError(f"{path}: no NumPy file of arrays of numbers ({error})") from error
+
+
+def _check_rates(recording: Recording, joints: Sequence[str]) -> None:
+    """Compare positions with the integrals of velocities over pieces of `_PIECE`."""
+    t, q, v, _ = (getattr(recording, key) for key in KEYS)
+    h = np.diff(t)
+    period = float(np.median(h))
+    whole = (h < 1.5 * period)[:, None]  # nothing is known of gaps
+    starts = np.arange(0, len(h), max(1, round(_PIECE / period)))
+    moved = np.add.reduceat(np.where(whole, np.diff(q, axis=0), 0.0), starts)
+    expected = np.add.reduceat(np.where(whole, 0.5 * h[:, None] * (v[1:] + v[:-1]), 0.0), starts)
+    way = np.linalg.norm(moved, axis=0)
+    off = np.linalg.norm(moved - expected, axis=0) / np.where(way > 0.0, way, 1.0)
+    worst = int(np.argmax(np.where(np.ptp(q, axis=0) > _MOVED, off, 0.0)))
+    if off[worst] > _RATE_ERROR and np.ptp(q[:, worst]) > _MOVED:
+        raise RecordingError(
+            f"'v' of {joints[worst]} differs by {off[worst]:.0%} from the rate of its 'q'; "
+            "allowed: s, rad and rad/s of one joint"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,7 +67,7 @@ class StateRecording:
 
     def __init__(self, joints: Sequence[str]) -> None:
         self._reader = JointStateReader(joints, needs_velocities=False)
-        self._n = len(joints)
+        self._joints, self._n = list(joints), len(joints)
         self._stamps: list[int] = []
         self._states: list[tuple[Array, Array, Array]] = []
 
@@ -102,8 +102,9 @@ class StateRecording:
         return self._column(2)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write t, q, v and tau to an ``npz`` file."""
-        np.savez_compressed(path, t=self.t, q=self.q, v=self.v, tau=self.tau)
+        """Write joints, t, q, v and tau to an ``npz`` file."""
+        joints = np.array(self._joints)
+        np.savez_compressed(path, joints=joints, t=self.t, q=self.q, v=self.v, tau=self.tau)
 
     def _column(self, which: int) -> Array:
         return np.array([state[which] for state in self._states]).reshape(-1, self._n)

@@ -20,6 +20,8 @@ from torque_safety_controller.friction.joint_recording import RecordingError, lo
 from torque_safety_controller.friction.settings import COEFFICIENTS
 from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import (
+    Array,
+    Robot,
     check_writable,
     overlay,
     read_robot,
@@ -57,9 +59,11 @@ def _run(options: argparse.Namespace) -> int:
         for path in (options.parameters, options.recording):
             if options.output.resolve() == path.resolve():
                 raise ParameterFileError(f"{options.output} is read, and cannot be written too")
-    model = read_robot(options.parameters).model
+    robot = read_robot(options.parameters)
+    model = robot.model
     names = list(model.names)[1:]
     recording = load_recording(options.recording, names)
+    _check_positions(options.recording, names, recording.q, robot)
     # With no terminal to draw on there is no bar.
     bar = tqdm(identify(model, recording), total=len(names), unit=" joints", disable=None)
     try:
@@ -76,6 +80,18 @@ def _run(options: argparse.Namespace) -> int:
         write_whole(options.output, text)
         print(f"\nwritten to {options.output}")
     return 0
+
+
+def _check_positions(path: Path, names: Sequence[str], q: Array, robot: Robot) -> None:
+    """Refuse positions that the joints cannot have, shape (N, n), rad."""
+    low, high, width = robot.q_min, robot.q_max, robot.q_max - robot.q_min
+    for name, column, least, most in zip(names, q.T, low - width, high + width, strict=True):
+        for value in (column.min(), column.max()):
+            if not least <= value <= most:
+                raise RecordingError(
+                    f"{path}: {name} is at {value:.3g} rad, beyond its limits by more than its "
+                    "range: degrees, or another robot?"
+                )
 
 
 def report(names: Sequence[str], fits: Sequence[JointFit]) -> None:
