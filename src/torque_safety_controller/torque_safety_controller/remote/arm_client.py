@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from torque_safety_controller.node.topics import HAND_POSE, TARGET_JOINT_TRAJECTORY, TARGET_POSE
-from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
 from viability_bounds_pkg.ros.messages import Arrival, JointStateReader, pose_message
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, is_subscribed, make_executor, set_stamp
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, JOINT_STATES, LIMIT_DISTANCES, Topic
@@ -128,6 +128,7 @@ class ArmClient:
         self._joints, self._timeout = list(joints), timeout
         self._heard: dict[str, Any] = {}
         self._status: dict[str, str] = {}
+        self._status_at = -math.inf
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = Node("arm_client", context=self._context, start_parameter_services=False)
@@ -165,9 +166,14 @@ class ArmClient:
     def state(self) -> ArmState:
         """Return the next state that comes."""
         self._heard.clear()
-        wanted = {topic.name for topic in _STATE}
-        self._wait(lambda: wanted <= self._heard.keys(), self._timeout, "the robot is silent")
+        for topic in _STATE:
+            name = topic.name
+            self._wait(lambda n=name: n in self._heard, self._timeout, f"nothing on '{name}'")
         (q, v, tau), margins = map(self._by_joint, (JOINT_STATES, LIMIT_DISTANCES))
+        if np.isnan(q).any():
+            missing = self._joints[int(np.isnan(q).argmax())]
+            hint = did_you_mean(missing, self._heard[JOINT_STATES.name].name)
+            raise NotReachedError(f"the robot does not tell where '{missing}' is{hint}")
         return ArmState(q, v, tau, self._hand(), margins)
 
     def move_to(
@@ -272,9 +278,12 @@ class ArmClient:
             if there():
                 return True
             refused = self._status.get("goals_refused", before)
-            if refused != before:
+            if refused not in (before, "none"):  # none after a restart of the controller
                 raise NotReachedError(f"the controller refused it: {refused} its log says why")
-            if time.monotonic() - sent > _SETTLED:
+            now = time.monotonic()
+            if now - sent > _SETTLED:
+                if now - self._status_at > _SETTLED:
+                    raise NotReachedError("the controller is silent")
                 if self._status.get("mode", "TRACKING") != "TRACKING":
                     raise NotReachedError(self._status["message"])
                 if (short := self._status.get("short_of_goal", "none")) != "none":
@@ -292,7 +301,8 @@ class ArmClient:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name.endswith("controller_node"):
+            if status.name == "controller_node":  # not that of another arm in a namespace
+                self._status_at = time.monotonic()
                 self._status = {pair.key: pair.value for pair in status.values}
                 self._status["message"] = status.message
 
