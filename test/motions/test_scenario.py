@@ -13,6 +13,7 @@ from sim_bridge.node.scenario_messages import to_controller
 from sim_bridge.node.scenario_node import ScenarioRefused
 from sim_bridge.scenario.events import TrajectoryGoal, read_trajectory
 from sim_bridge.scenario.scenario import Scenario
+from torque_safety_controller.driving.trajectory import TrajectoryMotion
 from torque_safety_controller.node.goal_messages import trajectory_from_message
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 from viability_bounds_pkg.testing.ros_harness import config_folder
@@ -56,6 +57,7 @@ def play_directly():
     loop = DirectLoop(ROBOT)
     start = loop.pose()
     trajectory = PoseTrajectory(circle(start, 0.5 * DIAMETER, PLANE, period=PERIOD))
+    motion = TrajectoryMotion(trajectory, 0, loop.dt)
     touched = []
 
     def before(t):
@@ -72,7 +74,7 @@ def play_directly():
             on = round(begin / loop.dt) <= k < round(end / loop.dt)
             loop.robot.apply_wrench(link, force if on else np.zeros(3), np.zeros(3))
         if k >= round(BEGIN / loop.dt):
-            loop.controller.goals.set_pose(*trajectory.sample(t - BEGIN))
+            motion.advance(loop.controller, loop.robot.state(), round(1e9 * t))
         touched.append(len(loop.robot.obstacles.contacts()) > 0)
 
     return loop.run(DURATION, before), np.array(touched), start

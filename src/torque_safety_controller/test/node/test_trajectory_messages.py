@@ -10,7 +10,12 @@ from arms import load_arm
 from controller_chain import MS, ControllerChain, gains_of, patient_values
 from controllers import make, pose_at
 from geometry_msgs.msg import Transform, Twist
-from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
+from trajectory_msgs.msg import (
+    JointTrajectory,
+    JointTrajectoryPoint,
+    MultiDOFJointTrajectory,
+    MultiDOFJointTrajectoryPoint,
+)
 
 from torque_safety_controller.node.goal_messages import GoalRefused, trajectory_from_message
 from torque_safety_controller.qp import AccelerationRange
@@ -103,7 +108,7 @@ def test_it_is_followed_in_the_robots_time(ros):
     wide = AccelerationRange(np.full(arm.n, -50.0), np.full(arm.n, 50.0))
     core = make(arm, gains=gains_of(values))
     core.reset(q)
-    points = circle(pose_at(arm, q), 0.05, PLANE, period=0.02, points_per_turn=8)
+    points = circle(pose_at(arm, q), 0.005, PLANE, period=0.02, points_per_turn=8)
     meant = PoseTrajectory(points)
     goals = ros.talk(MultiDOFJointTrajectory, "target_trajectory", GOAL_QOS)
     goals.publish(message_of(points, stamp=20 * MS, frame=""))
@@ -121,3 +126,24 @@ def test_it_is_followed_in_the_robots_time(ros):
     chain.await_goals()
     chain.ask(1002, q, v)
     ros.wait_until(lambda: "target_trajectory: 1" in chain.reported("goals_refused"))
+
+
+def test_it_waits_for_the_arm_and_is_given_up_far_away_from_it(ros):
+    chain = ControllerChain(ros, patient_values("panda"))
+    q, v = load_arm("panda").q_start, np.zeros(7)
+    goals = ros.talk(JointTrajectory, "target_joint_trajectory", GOAL_QOS)
+    point = JointTrajectoryPoint(positions=(q + 0.3).tolist())
+    point.time_from_start.sec = 1
+    chain.ask(20, q, v)
+    goals.publish(JointTrajectory(joint_names=chain.joints, points=[point]))
+    chain.await_goals()
+    for stamp in range(40, 2000, 20):
+        chain.ask(stamp, q, v)  # it is braked
+    told = "target_joint_trajectory waits for the arm"
+    ros.wait_until(lambda: told in chain.reported("message"), told)
+    for stamp in range(2000, 2500, 20):
+        v[0] = -1.0
+        q = q + 0.02 * v
+        chain.ask(stamp, q, v)  # it is pushed away
+    ros.wait_until(lambda: "target_joint_trajectory: 1" in chain.reported("goals_refused"))
+    assert told not in chain.reported("message")

@@ -13,11 +13,13 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator, PPoly
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.driving.jog import HAND_LEAD, JOINT_LEAD, TIMEOUT
+from torque_safety_controller.driving.pace import Pace
 from torque_safety_controller.tasks.pose_task import pose_error
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, quintic
@@ -203,45 +205,71 @@ class JointMotion:
     Args:
         trajectory: from the time `begin` on.
         begin: its time 0, ns; 0 for the first step.
+        dt: control period, s.
         q_min: lower position limits, shape (n,), rad; between points a polynomial may pass them.
         q_max: upper ones, shape (n,), rad.
         v_max: speed limits, shape (n,), rad/s; more is not fed forward.
         continuous: see `JointTrajectory.from_state`.
+
+    Attributes:
+        pace: how the trajectory waits for the arm.
     """
 
     def __init__(
         self,
         trajectory: JointTrajectory,
         begin: int,
+        dt: float,
         q_min: Array,
         q_max: Array,
         v_max: Array,
         continuous: NDArray[np.bool_] | None = None,
     ) -> None:
-        self._trajectory, self._begin, self._continuous = trajectory, begin, continuous
+        self._trajectory, self._continuous = trajectory, continuous
         self._q_min, self._q_max, self._v_max = q_min, q_max, v_max
         self._begun = False
+        self._off = np.zeros_like(v_max)
+        self.pace = Pace(begin, dt)
+
+    def where(self, joints: Sequence[str]) -> str:
+        """Return how far the arm is from the trajectory, in words."""
+        worst = int(np.abs(self._off).argmax())
+        return f"{joints[worst]} is {abs(self._off[worst]):.3g} rad away from it"
 
     def check_late(self, controller: Controller, state: State, stamp: int) -> None:
         """Raise `TrajectoryPassed` where the arm cannot join it any more."""
-        if self._begin:
-            late = 1e-9 * (stamp - self._begin)
+        if self.pace.begin:
+            late = 1e-9 * (stamp - self.pace.begin)
             self._trajectory.check_late(late, state, self._continuous)
 
     def advance(self, controller: Controller, state: State, stamp: int) -> bool:
         """Set the goal of one control step; see `Motion`."""
         if not self._begun:
-            self._begun, self._begin = True, self._begin or stamp
+            self._begun = True
             self._trajectory = self._trajectory.from_state(state, self._continuous)
-        t = 1e-9 * (stamp - self._begin)
+        t = self.pace.time(stamp)
         q, v, a = self._trajectory.sample(t)
+        self._off = q - state.q
+        self.pace.follow(joints_behind(self._off, v), float(np.abs(self._off).max()) / JOINT_LEAD)
+        rate = self.pace.rate
         controller.goals.release_pose()
         controller.goals.set_posture(
             np.clip(q, self._q_min, self._q_max),
-            np.clip(v, -self._v_max, self._v_max),
-            np.clip(a, -ACCELERATION_MAX, ACCELERATION_MAX),
+            np.clip(rate * v, -self._v_max, self._v_max),
+            np.clip(rate**2 * a, -ACCELERATION_MAX, ACCELERATION_MAX),
         )
-        return 0.0 <= t < self._trajectory.duration
+        return t < self._trajectory.duration
+
+
+def joints_behind(error: Array, v: Array) -> float:
+    """Return how far joints lag behind a moving goal, in times of `JOINT_LEAD`.
+
+    Args:
+        error: goal less positions, shape (n,), rad.
+        v: velocity of the goal, shape (n,), rad/s; slow joints count less.
+    """
+    fastest = float(np.abs(v).max())
+    return float((error * v).max()) / (fastest * JOINT_LEAD) if fastest > 0.0 else 0.0
 
 
 class TrajectoryMotion:
@@ -250,15 +278,26 @@ class TrajectoryMotion:
     Args:
         trajectory: in the URDF's root frame.
         begin: its time 0, ns; 0 for the first step.
+        dt: control period, s.
+
+    Attributes:
+        pace: how the trajectory waits for the arm.
     """
 
-    def __init__(self, trajectory: PoseTrajectory, begin: int) -> None:
-        self._trajectory, self._begin = trajectory, begin
+    def __init__(self, trajectory: PoseTrajectory, begin: int, dt: float) -> None:
+        self._trajectory = trajectory
+        self._off = [0.0, 0.0]
+        self.pace = Pace(begin, dt)
+
+    def where(self, joints: Sequence[str]) -> str:
+        """Return how far the hand is from the trajectory, in words."""
+        return "the hand is {:.3g} m and {:.3g} rad away from it".format(*self._off)
 
     def check_late(self, controller: Controller, state: State, stamp: int) -> None:
         """Raise `TrajectoryPassed` where the hand cannot join it any more."""
-        late = 1e-9 * (stamp - self._begin)
-        if not self._begin or late <= TIMEOUT:
+        begin = self.pace.begin
+        late = 1e-9 * (stamp - begin)
+        if not begin or late <= TIMEOUT:
             return
         if late >= self._trajectory.duration:
             raise TrajectoryPassed(late)
@@ -270,7 +309,18 @@ class TrajectoryMotion:
 
     def advance(self, controller: Controller, state: State, stamp: int) -> bool:
         """Set the goal of one control step; see `Motion`."""
-        self._begin = self._begin or stamp
-        t = 1e-9 * (stamp - self._begin)
-        controller.goals.set_pose(*self._trajectory.sample(t))
+        t = self.pace.time(stamp)
+        pose, twist, twist_rate = self._trajectory.sample(t)
+        # The hand of the last step: one period's motion is far less than the lead.
+        hand = controller.robot.pose
+        error = pose.rotation.T @ (pose.translation - hand.translation)
+        turn = pin.log3(hand.rotation.T @ pose.rotation)
+        behind = 0.0
+        for k, (e, w) in enumerate(((error, twist[:3]), (turn, twist[3:]))):
+            self._off[k] = math.sqrt(e.dot(e))
+            if (speed := math.sqrt(w.dot(w))) > 0.0:
+                behind = max(behind, float(e.dot(w)) / (speed * HAND_LEAD[k]))
+        self.pace.follow(behind, max(self._off[0] / HAND_LEAD[0], self._off[1] / HAND_LEAD[1]))
+        rate = self.pace.rate
+        controller.goals.set_pose(pose, rate * twist, rate**2 * twist_rate)
         return t < self._trajectory.duration

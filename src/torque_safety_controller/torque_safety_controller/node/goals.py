@@ -119,6 +119,7 @@ class GoalSubscriber:
         self._contested: set[str] = set()
         self._unserved: set[str] = set()
         self._told, self._told_at = "", -math.inf
+        self._held_up: Motion | None = None
         self.listen(TARGET_POSE, self._on_pose)
         if len(config.end_effectors) > 1:
             self.listen(TARGET_POSE_SECOND, self._on_second_pose)
@@ -143,7 +144,10 @@ class GoalSubscriber:
 
     @property
     def due(self) -> str:
-        """Which goal is the next that waits for its time, and how long; empty if there is none."""
+        """Which goal waits, for the arm or for its time, in words; empty if there is none."""
+        motion = self.motion
+        if isinstance(motion, (JointMotion, TrajectoryMotion)) and motion.pace.waits:
+            return f"{_topic_of(motion)} waits for the arm"
         if not self._waiting or (left := self._waiting[0].stamp - self._states.stamp) <= 0:
             return ""
         return f"{self._waiting[0].topic.name} due in {1e-9 * left:.1f} s"
@@ -225,7 +229,22 @@ class GoalSubscriber:
             return due
         if not self.motion.advance(self._controller, state, stamp):
             self.motion = None
+        elif isinstance(self.motion, (JointMotion, TrajectoryMotion)):
+            self._watch_pace(self.motion)
         return True
+
+    def _watch_pace(self, motion: JointMotion | TrajectoryMotion) -> None:
+        """Tell once that a trajectory waits for the arm; give it up where they are far apart."""
+        if motion.pace.lost:
+            what = "given up"
+            self._jog_joints(np.zeros(len(self._config.joints)))  # to rest
+            self.refused[_topic_of(motion)] += 1
+        elif motion.pace.waits and self._held_up is not motion:
+            self._held_up, what = motion, "waits for the arm"
+        else:
+            return
+        where = motion.where(self._config.joints)
+        self._node.get_logger().warning(f"{_topic_of(motion)} {what}: {where}")
 
     def _try(self, topic: Topic, act: Callable[[], None]) -> None:
         try:
@@ -285,7 +304,8 @@ class GoalSubscriber:
     def _on_trajectory(self, message: MultiDOFJointTrajectory) -> None:
         frames = self._config.base_frame, self._config.end_effectors[0]
         trajectory = trajectory_from_message(message, *frames, self._base)
-        motion = TrajectoryMotion(trajectory, stamp_to_ns(message.header.stamp))
+        begin = stamp_to_ns(message.header.stamp)
+        motion = TrajectoryMotion(trajectory, begin, self._config.dt)
         self.add(TARGET_TRAJECTORY, message, lambda: self._move(motion))
 
     def _on_joint_trajectory(self, message: JointTrajectory) -> None:
@@ -298,11 +318,11 @@ class GoalSubscriber:
         if excess[worst := int(excess.argmax())] > 1.0:
             self._node.get_logger().warning(
                 f"target_joint_trajectory: {config.joints[worst]} is asked for "
-                f"{excess[worst]:.3g} times its velocity_max: the arm falls behind"
+                f"{excess[worst]:.3g} times its velocity_max: it takes longer"
             )
         limits = config.position_min, config.position_max, config.velocity_max
         begin = stamp_to_ns(message.header.stamp)
-        motion = JointMotion(trajectory, begin, *limits, config.continuous)
+        motion = JointMotion(trajectory, begin, config.dt, *limits, config.continuous)
         self.add(topic, message, lambda: self._move(motion))
 
     def _on_hand_jog(self, message: TwistStamped) -> None:
@@ -350,3 +370,8 @@ class GoalSubscriber:
             jog()
 
         self.add(topic, message, apply)
+
+
+def _topic_of(motion: JointMotion | TrajectoryMotion) -> str:
+    of_joints = isinstance(motion, JointMotion)
+    return (TARGET_JOINT_TRAJECTORY if of_joints else TARGET_TRAJECTORY).name
