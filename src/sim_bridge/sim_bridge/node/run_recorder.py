@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from numpy.typing import NDArray
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -68,6 +69,7 @@ class RunRecorder:
     Args:
         node: subscribes.
         joints: joints to record, in this order.
+        continuous: see `JointStateReader`; recorded without leaps.
         file: to which all messages go, too, as they came; None for none.
 
     Attributes:
@@ -79,7 +81,13 @@ class RunRecorder:
             name.
     """
 
-    def __init__(self, node: ArmNode, joints: Sequence[str], file: McapFile | None = None) -> None:
+    def __init__(
+        self,
+        node: ArmNode,
+        joints: Sequence[str],
+        continuous: NDArray[np.bool_],
+        file: McapFile | None = None,
+    ) -> None:
         self._unfiled: list[tuple[str, bytes]] = []
         self.stamp = self.answered = -1
         self.q: Array = np.zeros(len(joints))
@@ -92,7 +100,7 @@ class RunRecorder:
         }
         self.topics: tuple[str, ...] = ()
         self._joints = tuple(joints)
-        self._reader = JointStateReader(joints, needs_velocities=False)
+        self._reader = JointStateReader(joints, needs_velocities=False, continuous=continuous)
         self._states: dict[int, tuple[Array, Array]] = {}
         self._limits: dict[int, list[Sequence[float]]] = {}
         self._torques: dict[int, Sequence[float]] = {}

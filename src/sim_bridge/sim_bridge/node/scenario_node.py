@@ -89,7 +89,7 @@ class ScenarioNode(ArmNode):
         self.awaits = ""
         self.ended: Future[None] = Future()
         self.failure: ScenarioRefused | None = None
-        self.recorder = RunRecorder(self, config.joints, file)
+        self.recorder = RunRecorder(self, config.joints, config.continuous, file)
         self._first, self._period = 0, 1
         self._refused: dict[str, list[str]] | None = None  # when the messages begin; else None
         frames = config.base_frame, config.end_effectors[0]

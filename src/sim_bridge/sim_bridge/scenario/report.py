@@ -341,7 +341,8 @@ def _draw(
         strict=True,
     ):
         left.plot(run.t, values[:, j])
-        right.plot(run.t, (2.0 * values - lower - upper) / (upper - lower))
+        with np.errstate(invalid="ignore"):  # joints without limits are left out
+            right.plot(run.t, (2.0 * values - lower - upper) / (upper - lower))
         left.set(ylabel=f"{name} [{unit}]")
         right.set(ylabel=f"{name} / limit")
         for axis, limits in ((left, (lower[j], upper[j])), (right, (-1.0, 1.0))):

@@ -77,3 +77,20 @@ def test_a_recording_has_a_row_for_each_period_and_tells_the_robot_what_it_has(r
     np.testing.assert_allclose(run.t, 1e-9 * np.array([0, 10, 20, 30, 40]))
     np.testing.assert_array_equal(run.q[:, 0], [10, 20, np.nan, 40, np.nan])
     assert run.lost == 5  # there are no limits either
+
+
+def test_angles_that_a_driver_wraps_do_not_leap_in_figures(ros, tmp_path):
+    arguments(tmp_path)
+    values = read_config("panda", "scenario_node") | {"scenario": str(tmp_path / "scenario.yaml")}
+    for name in ("position_min", "position_max"):
+        values[name] = [np.inf if name == "position_max" else -np.inf, *values[name][1:]]
+    player = ros.start(scenario_node.ScenarioNode, values)
+    states, rest = ros.talk(JointState, "joint_states"), [0.0] * 6
+    for stamp, angle in ((10, 3.1), (20, -3.1)):  # ns, rad
+        state = joint_state(values["joints"], stamp, [angle, *rest], [0.0] * 7)
+        ros.wait_until(
+            lambda s=stamp: player.recorder.stamp == s,
+            each=lambda s=state: states.publish(s),
+        )
+    q = player.recorder.run(10, period=10, periods=2).q[:, 0]
+    np.testing.assert_allclose(q, [3.1, 2.0 * np.pi - 3.1])

@@ -63,10 +63,11 @@ class StateRecording:
 
     Args:
         joints: names of the n joints.
+        continuous: see `JointStateReader`; their angles do not leap, whatever the driver reports.
     """
 
-    def __init__(self, joints: Sequence[str]) -> None:
-        self._reader = JointStateReader(joints, needs_velocities=False)
+    def __init__(self, joints: Sequence[str], continuous: NDArray[np.bool_] | None = None) -> None:
+        self._reader = JointStateReader(joints, needs_velocities=False, continuous=continuous)
         self._joints, self._n = list(joints), len(joints)
         self._stamps: list[int] = []
         self._states: list[tuple[Array, Array, Array]] = []
@@ -256,7 +257,7 @@ class ArmClient:
     @contextmanager
     def record(self) -> Iterator[StateRecording]:
         """Keep the states that come while methods of this client wait, in a ``with`` statement."""
-        recording = StateRecording(self._joints)
+        recording = StateRecording(self._joints, np.isinf(self.state().margins[0]))
         subscription = self._node.create_subscription(
             JointState, JOINT_STATES.name, recording.add, _RECORDING_QOS
         )
