@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of the viewer: what it sends for its user, and a drag in a real browser."""
 
+import math
 import time
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from browser import Browser, find_browser
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from sim_bridge.node import viewer_node
 from sim_bridge.node.bullet_node import BulletNode
 from sim_bridge.node.viewer_node import PERIOD, PageCommands, ViewerNode
 from sim_bridge.viewer.page import DrivingAsked, GoalAsked, PushAsked
@@ -18,7 +22,9 @@ from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.robot.description import build_model
 from viability_bounds_pkg.robot.files import read_urdf
-from viability_bounds_pkg.testing.ros_harness import read_config
+from viability_bounds_pkg.ros.messages import pose_message
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, NEWEST_QOS, STATUS_QOS
+from viability_bounds_pkg.testing.ros_harness import joint_state, read_config
 
 KINDS = (ControllerNode, BoundsNode, ViewerNode, BulletNode)
 PATIENT = {"clock": "lockstep", "bounds_timeout": 5.0, "state_timeout": 10.0}
@@ -52,6 +58,46 @@ def test_nothing_is_sent_but_while_the_user_drives(ros):
     user.send(DrivingAsked(False))
     ros.wait_until(lambda: pushes[-1].wrench.force.y == 0.0, "the end of the push")
     ros.wait_until(lambda: publishers() == 0)
+
+
+def test_the_page_tells_of_its_own_robot_and_of_what_is_heard(ros, monkeypatch):
+    viewer = ros.start(ViewerNode, VALUES)
+    told = ros.talk(DiagnosticArray, "/diagnostics", STATUS_QOS)
+
+    def say(name, **values):
+        pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+        status = DiagnosticStatus(name=name, message=f"{name} here", values=pairs)
+        told.publish(DiagnosticArray(status=[status]))
+
+    def shown(text):
+        return text in viewer._status_text()
+
+    say("left/bullet_node", paused="True")
+    say("left/controller_node")
+    say("controller_node")
+    ros.wait_until(lambda: shown("**The controller** controller_node here"))
+    viewer.update_page()
+    assert not viewer._commands.robot_paused
+    monkeypatch.setattr(viewer_node, "_STATUS_OLD", -1.0)
+    assert shown("**The controller** is not heard")
+    # Joint states of another robot, and goals that the controller refuses.
+    states = ros.talk(JointState, "slow/joint_states", NEWEST_QOS)
+    each = partial(states.publish, joint_state(["left_s0"], 1, [0.0], [0.0]))
+    ros.wait_until(lambda: shown("**joint states are refused: missing joint**"), each=each)
+    goals = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
+    for x, frame in ((0.4, "panda_link0"), (0.5, "world"), (math.nan, "")):
+        goals.publish(pose_message(pin.SE3(np.eye(3), np.array([x, 0.0, 0.0])), frame))
+    ros.wait_until(lambda: viewer._goal is not None)
+    ros.run_for(0.1)
+    assert viewer._goal.translation[0] == 0.4
+
+
+def test_driving_ends_with_the_last_page(ros):
+    viewer = ros.start(ViewerNode, VALUES)
+    viewer.page._drive.value = True
+    ros.wait_until(lambda: ros.probe.count_publishers("target_pose"), each=viewer.update_page)
+    viewer.page._on_leave(None)
+    ros.wait_until(lambda: not ros.probe.count_publishers("target_pose"), each=viewer.update_page)
 
 
 class Viewed:

@@ -59,6 +59,8 @@ PERIOD = 0.05
 """Time between two pictures, s."""
 _SILENT = 1.0
 """Time without joint states after which the page says so, s."""
+_STATUS_OLD = 5.0
+"""Age from which a status no longer counts, s; they come twice a second."""
 _VIOLATIONS = {"position_violation_rad": "rad", "velocity_violation_rad_s": "rad/s"}
 _MODES = {
     "TRACKING: goal": "follows its goal",
@@ -170,13 +172,14 @@ class ViewerNode(ArmNode):
         with self.starting():
             config = NodeParameters(self, ViewerConfiguration).configuration
             self.page = _make_page(config, robot_urdf(config, self))
-        self._reader = JointStateReader(config.joints)
+        self._reader = JointStateReader(config.joints, warn=self._warn)
         self._unknown = np.full(len(config.joints), math.nan)
         self._limits = self._unknown, self._unknown
         self._before: tuple[int, Array] | None = None  # stamp, ns, and speeds in the last picture
         self._acceleration = self._unknown
         self._goal: pin.SE3 | None = None
-        self._status: dict[str, tuple[str, dict[str, str]]] = {}
+        self._status: dict[str, tuple[float, str, dict[str, str]]] = {}
+        self._base_frame = config.base_frame
         self._commands = PageCommands(self, config.base_frame)
         SLOW_JOINT_STATES.subscription(self, self._on_state)
         SLOW_ACCELERATION_LIMITS.subscription(self, self._on_limits)
@@ -194,6 +197,7 @@ class ViewerNode(ArmNode):
 
     def update_page(self) -> None:
         """Send what the user asked for, and show what is known."""
+        self._commands.robot_paused = self._told("bullet_node")[1].get("paused") == "True"
         for request in self.page.requests():
             self._commands.send(request)
         if self._reader.accepted == 0:
@@ -218,18 +222,31 @@ class ViewerNode(ArmNode):
             self._before = stamp, v
         return self._acceleration
 
+    def _told(self, name: str) -> tuple[str, dict[str, str]]:
+        """Return message and values of the status of a node, if it was heard lately."""
+        at, message, values = self._status.get(name, (-math.inf, "", {}))
+        if time.monotonic() - at > _STATUS_OLD:
+            return "is not heard", {}
+        return message, values
+
     def _status_text(self) -> str:
         lines = []
         if time.monotonic() - self._reader.heard_at > _SILENT:
             if self._commands.robot_paused:
                 return "the simulated robot is paused"
-            lines.append("**`bounds_node` sends no joint states**")
-        message, _ = self._status.get("controller_node", ("is not heard", {}))
+            why = ", ".join(self._reader.refused)
+            refused = why and not self._reader.accepted
+            lines.append(
+                f"**joint states are refused: {why}**"
+                if refused
+                else "**`bounds_node` sends no joint states**"
+            )
+        message, _ = self._told("controller_node")
         for mode, words in _MODES.items():
             if message.startswith(mode):
                 message = words + message.removeprefix(mode)
         lines.append(f"**The controller** {message}")
-        _, robot = self._status.get("bullet_node", ("", {}))
+        _, robot = self._told("bullet_node")
         beyond = {
             unit: max(map(float, robot[key].split()))
             for key, unit in _VIOLATIONS.items()
@@ -251,15 +268,16 @@ class ViewerNode(ArmNode):
             self._limits = limits[0], limits[1]
 
     def _on_goal(self, message: PoseStamped) -> None:
-        self._goal = _pose(message)
+        # The controller refuses others, and keeps the goal that it has.
+        if message.header.frame_id in ("", self._base_frame):
+            self._goal = _pose(message) or self._goal
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            name = status.name.rpartition("/")[2]
-            values = {value.key: value.value for value in status.values}
-            self._status[name] = status.message, values
-            if name == "bullet_node":
-                self._commands.robot_paused = values.get("paused") == "True"
+            place, _, name = status.name.rpartition("/")
+            if place == self.get_namespace().strip("/"):  # not of another arm
+                values = {value.key: value.value for value in status.values}
+                self._status[name] = time.monotonic(), status.message, values
 
 
 def _pose(message: PoseStamped) -> pin.SE3 | None:

@@ -86,6 +86,7 @@ class Page:
         self._driving = self._dragging = self._pushing = self._camera_placed = False
         with redirect_stdout(io.StringIO()):  # its banner, even if not verbose
             self._server = viser.ViserServer(*address, label="arm", verbose=False)
+        self._server.on_client_disconnect(self._on_leave)
         self.address = f"http://{address[0]}:{self._server.get_port()}"
         self._make_scene(shapes)
         self._make_panel()
@@ -227,6 +228,11 @@ class Page:
     def _on_drive(self, _: Any) -> None:
         self._driving = self._drive.value
         self._requests.put(DrivingAsked(self._driving))
+
+    def _on_leave(self, _: Any) -> None:
+        """End driving when nobody has the page open any more."""
+        if not self._server.get_clients():
+            self._drive.value = False  # its callback follows
 
     def _on_goal(self, event: viser.TransformControlsEvent) -> None:
         self._dragging = event.phase != "end"
