@@ -91,7 +91,7 @@ class User:
         CLIENTS.append(self.client)
         ros.wait_until(self.client.server_is_ready)
         self.states = ros.listen(JointState, "joint_states")
-        ros.start(ControllerNode, VALUES | {"state_timeout": silence})
+        self.controller = ros.start(ControllerNode, VALUES | {"state_timeout": silence})
         ros.start(BoundsNode, VALUES | {"state_timeout": silence})
         self.robot = ros.start(BulletNode, VALUES)
         ros.wait_until(lambda: len(self.states) > 2)
@@ -240,3 +240,11 @@ def test_a_robot_that_falls_silent_ends_it(ros, moveit):
     status, code, text = user.wait(goal)
     assert (status, code) == (GoalStatus.STATUS_ABORTED, -4)
     assert "silent" in text or "STOPPED" in text
+
+
+def test_a_controller_that_goes_ends_it(ros, moveit):
+    user = User(ros, moveit)
+    goal = user.send(duration=1000.0)
+    ros.wait_until(lambda: goal.feedback)
+    ros.stop(user.controller)
+    assert user.wait(goal) == (GoalStatus.STATUS_ABORTED, -4, "the controller has gone")

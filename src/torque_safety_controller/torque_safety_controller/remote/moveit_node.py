@@ -280,6 +280,8 @@ class MoveitNode(ArmNode):
             self._send(run, run.execution, now)
         elif now - self._reader.heard_at > _SILENT:
             self._end(run, Result.PATH_TOLERANCE_VIOLATED, "the joint states are silent")
+        elif not self._trajectories.ready:
+            self._end(run, Result.PATH_TOLERANCE_VIOLATED, "the controller has gone")
         elif self._mode in ("STOPPED", "POSITION"):
             text = f"the controller's mode is {self._mode}; /diagnostics tell why"
             self._end(run, Result.PATH_TOLERANCE_VIOLATED, text)
