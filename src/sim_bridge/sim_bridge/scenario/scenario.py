@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 from sim_bridge.scenario.events import (
     AddObstacle,
     Event,
+    Goal,
     PostureGoal,
     Push,
     RemoveObstacle,
@@ -103,6 +104,7 @@ def load_scenario(path: str | Path) -> Scenario:
             if event.time >= duration:
                 raise refuse(f"events[{i}].time", event.time, f"less than {duration:g}, the end")
         events.sort(key=lambda event: event.time)
+        _check_goals(events)
         _check_pushes(events)
         _check_obstacles(events)
     except ScenarioError as error:
@@ -114,6 +116,17 @@ def _events(content: Any, where: str) -> list[Event]:
     if not isinstance(content, list | None):
         raise refuse(where, content, "a list")
     return [read_event(entry, f"{where}[{i}]") for i, entry in enumerate(content or ())]
+
+
+def _check_goals(events: list[Event]) -> None:
+    """Refuse goals of one kind at one time: the last one alone would count."""
+    seen: set[tuple[type, float]] = set()
+    for goal in (event for event in events if isinstance(event, Goal)):
+        kind = type(goal), goal.time
+        if kind in seen:
+            what = kind[0].__name__.removesuffix("Goal").lower()
+            raise ScenarioError(f"there are two of {what} at {goal.time:g} s; allowed: one")
+        seen.add(kind)
 
 
 def _check_pushes(events: list[Event]) -> None:

@@ -125,6 +125,7 @@ def test_an_event_that_cannot_be_is_named(tmp_path, kind, content, names):
     assert names in str(error.value)
 
 
+POSTURE = "{time: 1, posture: {a: 0}}"
 PUSH = "push: {link: a, duration: 2, force: [1, 0, 0]}"
 
 
@@ -143,6 +144,7 @@ PUSH = "push: {link: a, duration: 2, force: [1, 0, 0]}"
             f"duration: 9\nevents: [{{time: 0, {PUSH}}}, {{time: 1, {PUSH}}}]",
             "the push of a at 1 s begins before",
         ),
+        (f"duration: 9\nevents: [{POSTURE}, {POSTURE}]", "two of posture at 1 s; allowed: one"),
     ],
 )
 def test_a_file_that_cannot_be_played_is_named(tmp_path, text, names):
