@@ -9,7 +9,7 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -61,7 +61,8 @@ _SILENT = 1.0
 """Time without joint states after which the page says so, s."""
 _STATUS_OLD = 5.0
 """Age from which a status no longer counts, s; they come twice a second."""
-_VIOLATIONS = {"position_violation_rad": "rad", "velocity_violation_rad_s": "rad/s"}
+_VIOLATIONS = {"position_violation_rad": "", "velocity_violation_rad_s": "/s"}
+"""Keys of the robot's diagnostics, and what follows the unit of a joint's position there."""
 _MODES = {
     "TRACKING: goal": "follows its goal",
     "HOLD": "holds the arm",
@@ -171,7 +172,9 @@ class ViewerNode(ArmNode):
         super().__init__(**node_arguments)
         with self.starting():
             config = NodeParameters(self, ViewerConfiguration).configuration
-            self.page = _make_page(config, robot_urdf(config, self))
+            urdf = robot_urdf(config, self)
+            self.page = _make_page(config, urdf)
+        self._units = units_of(urdf, config.joints)
         self._reader = JointStateReader(config.joints, warn=self._warn)
         self._unknown = np.full(len(config.joints), math.nan)
         self._limits = self._unknown, self._unknown
@@ -247,14 +250,11 @@ class ViewerNode(ArmNode):
                 message = words + message.removeprefix(mode)
         lines.append(f"**The controller** {message}")
         _, robot = self._told("bullet_node")
-        beyond = {
-            unit: max(map(float, robot[key].split()))
-            for key, unit in _VIOLATIONS.items()
-            if robot.get(key)
-        }
-        if any(value > 1e-9 for value in beyond.values()):  # not by rounding
-            most = ", ".join(f"{value:.2g} {unit}" for unit, value in beyond.items())
-            lines.append(f"limits of joints were passed, by at most {most}")
+        beyond = passed_limits(robot, self._units)
+        # Not by rounding; what is no number counts.
+        passed = [f"{value:.2g} {unit}" for unit, value in beyond.items() if not value <= 1e-9]
+        if passed:
+            lines.append(f"limits of joints were passed, by at most {', '.join(passed)}")
         elif beyond:
             lines.append("all limits of the joints were kept so far")
         return "  \n".join(lines)
@@ -289,6 +289,21 @@ def _pose(message: PoseStamped) -> pin.SE3 | None:
         return None
     numbers[3:] /= length
     return pin.XYZQUATToSE3(numbers)
+
+
+def passed_limits(robot: Mapping[str, str], units: Sequence[str]) -> dict[str, float]:
+    """Return by how much limits were passed at most, by unit: angles and ways are not compared.
+
+    Args:
+        robot: its diagnostics; nothing is known without them.
+        units: of the joints' positions.
+    """
+    beyond: dict[str, float] = {}
+    for key, per in _VIOLATIONS.items():
+        for unit, value in zip(units, robot.get(key, "").split(), strict=False):
+            before = beyond.get(unit + per, 0.0)
+            beyond[unit + per] = float(np.maximum(before, float(value)))
+    return beyond
 
 
 def _make_page(config: ViewerConfiguration, urdf: str) -> Page:

@@ -17,9 +17,11 @@ KEPT = {
     "max_velocity_violation_rad_s": 0.0,
     "max_torque_ratio": 0.9,
     "most_violated_joint": None,
+    "most_too_fast_joint": None,
     "joints": {"left_e1": {"unit": "rad"}},
 }
-SLIDE = {"joints": {"left_e1": {"unit": "m"}}, "max_velocity_violation_rad_s": 0.5}
+FAST = {"max_velocity_violation_rad_s": 0.5, "most_too_fast_joint": "left_e1"}
+SLIDE = {"joints": {"left_e1": {"unit": "m"}, "lift": {"unit": "rad"}}}
 BROKEN = {
     "limits_kept": False,
     "max_position_violation_rad": 0.02,
@@ -38,8 +40,8 @@ REASON = "the promise needs a command in every period"
         (BROKEN | MISSED, f"7 of 6145 deadlines were missed: {REASON}", "braked"),
         (BROKEN | {"braked_periods": 9}, REASON, "speed"),
         (BROKEN | MISSED | {"bounds_method": "naive"}, "deadlines were missed.", REASON),
-        (BROKEN | {"max_velocity_violation_rad_s": 0.5}, "speed by 0.5 rad/s", "torque"),
-        (BROKEN | SLIDE, "position by 0.02 m (left_e1); speed by 0.5 m/s.", "rad"),
+        (BROKEN | FAST, "speed by 0.5 rad/s", "torque"),
+        (BROKEN | FAST | SLIDE, "position by 0.02 m (left_e1); speed by 0.5 m/s (left", "rad"),
         ({"limits_kept": False, "max_torque_ratio": 1.2}, "torque, 1.2 of its limit", "position"),
         ({"recording_lost_periods": 9}, "recording lacks messages of 9 of 6145 periods", REASON),
         ({"torque_rates_clipped": True}, "limits are not promised", REASON),

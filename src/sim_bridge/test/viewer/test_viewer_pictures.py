@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sim_bridge.node.viewer_node import passed_limits
 from sim_bridge.viewer.joint_pictures import JointPictures, JointValues, usage
 from sim_bridge.viewer.shapes import visual_shapes
 from viability_bounds_pkg.joint_limits import JointLimits
@@ -117,3 +118,12 @@ def test_a_missing_mesh_is_refused():
     urdf = URDF.replace('<sphere radius="0.3"/>', '<mesh filename="package://nowhere/link.stl"/>')
     with pytest.raises(RobotDescriptionError, match="nowhere"):
         visual_shapes(urdf, build_model(urdf, ["first", "second"]), {})
+
+
+def test_passed_limits_of_slides_and_others_are_told_apart():
+    robot = {"position_violation_rad": "0.02 0.3 0.01", "velocity_violation_rad_s": "0.0 nan 0.5"}
+    told = passed_limits(robot, ["m", "rad", "m"])
+    assert told == pytest.approx(
+        {"m": 0.02, "rad": 0.3, "m/s": 0.5, "rad/s": math.nan}, nan_ok=True
+    )
+    assert passed_limits({}, ["m", "rad", "m"]) == {}
