@@ -160,6 +160,12 @@ def obstacle(**changes):
         (obstacle(size=[0.4, 1.0, 0.0]), "obstacles[4].size", "3 finite numbers > 0"),
         (obstacle(shape="sphere", size=[1.0, 2.0, 1.0]), "obstacles[4].size", "the same diameter"),
         (obstacle(position=[0.0, True, 0.0]), "obstacles[4].position", "3 finite numbers"),
+        (obstacle(position=[400.0, 0.0, 0.0]), "obstacles[4].position", ">= -100 and <= 100"),
+        (
+            {"collision_capsules": ["{link: a, start: [0, 0, 0], end: [0, 0, 60], radius: 1}"]},
+            "collision_capsules[0].end",
+            ">= -10 and <= 10",
+        ),
         ({"obstacles": ["{name: a"]}, "obstacles[0]", "a YAML mapping with the fields name, "),
         (
             {"obstacles": ["{colour: red}"]},

@@ -19,6 +19,8 @@ from viability_bounds_pkg.parameter import (
     NEGATIVE,
     NOT_NEGATIVE,
     POSITIVE,
+    Range,
+    above,
     group,
     joint_numbers,
     number,
@@ -122,6 +124,7 @@ def _contact_points(entries: tuple[str, ...]) -> tuple[ContactPoint, ...]:
     return points
 
 
+_OF_LINK = Range(-10.0, 10.0)  # m; more are millimetres
 _EQUAL = {"cylinder": 2, "sphere": 3}  # of the numbers of a size, how many are one diameter
 
 
@@ -132,7 +135,7 @@ class ObstacleEntry:
     name: str = text("what no other obstacle is called")
     shape: str = text("what it is", choices=SHAPES)
     size: Array = numbers("as in a Marker, m", POSITIVE, length=3, default=())
-    position: Array = numbers("of its centre, m", FINITE, length=3)
+    position: Array = numbers("of its centre, m", Range(-100.0, 100.0), length=3)
     rpy: Array = numbers("about the axes x, y, z, rad", FINITE, length=3, default=(0.0, 0.0, 0.0))
 
 
@@ -141,9 +144,9 @@ class CapsuleEntry:
     """One entry of ``collision_capsules``."""
 
     link: str = text("link that it is around")
-    start: Array = numbers("one end of its axis in the link's frame, m", FINITE, length=3)
-    end: Array = numbers("other end, m", FINITE, length=3)
-    radius: float = number("distance from the axis, m", POSITIVE)
+    start: Array = numbers("one end of its axis in the link's frame, m", _OF_LINK, length=3)
+    end: Array = numbers("other end, m", _OF_LINK, length=3)
+    radius: float = number("distance from the axis, m", above(0.0, 10.0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -64,6 +64,7 @@ class Teleop:
         self._frame, self._sign = 0, 1.0
         self._message: TwistStamped | JointState | None = None
         self._until = 0.0
+        self._unheard = False
 
     def press(self, key: str, now: float) -> str:
         """Handle a key pressed at `now`, s; return what to tell the user, or nothing."""
@@ -77,7 +78,8 @@ class Teleop:
         if message is None or type(message) is not type(self._message):
             self.stop()
         self._message, self._until = message, now + HELD
-        return ""
+        before, self._unheard = self._unheard, not self._hand.get_subscription_count()
+        return "no controller is heard" if self._unheard and not before else ""
 
     def tick(self, now: float) -> None:
         """Publish the jog of the key that is held at `now`, s."""
@@ -160,9 +162,10 @@ def _run(options: argparse.Namespace) -> int:
 def _loop(teleop: Teleop, terminal: int) -> None:
     while True:
         if select.select([terminal], [], [], PERIOD)[0]:
-            for key in os.read(terminal, 64).decode(errors="ignore"):
-                if key == "x":
-                    return
+            keys = os.read(terminal, 64).decode(errors="ignore")
+            if "x" in keys or not keys:  # none: the terminal has gone
+                return
+            for key in keys:
                 if told := teleop.press(key, time.monotonic()):
                     print(told)
         teleop.tick(time.monotonic())
