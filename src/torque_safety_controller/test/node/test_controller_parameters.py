@@ -97,6 +97,17 @@ def test_bad_values_are_refused_and_the_old_ones_stay(ros):
     [
         ({"joints": [*JOINTS[:6], "left_w9"]}, "joints", "unknown joint 'left_w9'"),
         ({"locked_joints": ["x"], "locked_positions": [0.1]}, "locked_joints", "'x'"),
+        (
+            {"locked_joints": ["torso_t0"] * 2, "locked_positions": [0.1, 0.2]},
+            "locked_joints",
+            "each once",
+        ),
+        (
+            {"locked_joints": JOINTS[:1], "locked_positions": [0.1]},
+            "locked_joints",
+            "none of 'joints'",
+        ),
+        ({"ros2_control_topic": "a b"}, "ros2_control_topic", "the name of a topic"),
         ({"end_effector_frame": "nowhere"}, "end_effector_frame", "unknown frame 'nowhere'"),
         ({"torque_max": [math.nan, *ARM.tau_max[1:]]}, "torque_max", "nan"),
         ({"torque_max": None, "robot_description": "topic"}, "torque_max", "not set"),

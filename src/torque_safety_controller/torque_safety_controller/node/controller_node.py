@@ -109,7 +109,8 @@ class ControllerNode(ArmNode):
             },
             self._goals,
         )
-        self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
+        with self.starting():
+            self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         self._published = StatePublisher(self, self._controller.robot, config, base, self._states)
         ENABLE_TORQUE.serve(self, self._on_enable_torque)
         self.listen_to_states(config.use_estimated_states, self._on_state)

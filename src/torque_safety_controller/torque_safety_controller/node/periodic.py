@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rclpy.exceptions import InvalidTopicNameException
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.node.topics import ROS2_CONTROL_EFFORTS
 from torque_safety_controller.qp import AccelerationRange
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.plausible import RESTART_GAP, PlausibilityCheck
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Arrival, JointOrder, JointStateReader, count_refusal
@@ -182,6 +184,9 @@ class JointCommands:
         node: the publishing node.
         joints: names of the n joints.
         ros2_control_topic: of the torques in `joints` order; empty for none.
+
+    Raises:
+        SettingError: it is no name of a topic.
     """
 
     def __init__(self, node: ArmNode, joints: Sequence[str], ros2_control_topic: str) -> None:
@@ -193,7 +198,11 @@ class JointCommands:
         self._commands = node.stream(JOINT_COMMANDS)
         self._efforts = None
         if ros2_control_topic:
-            self._efforts = ROS2_CONTROL_EFFORTS.publisher(node, ros2_control_topic)
+            try:
+                self._efforts = ROS2_CONTROL_EFFORTS.publisher(node, ros2_control_topic)
+            except InvalidTopicNameException as error:
+                allowed = "the name of a topic"
+                raise SettingError("ros2_control_topic", ros2_control_topic, allowed) from error
             node.publisher_watch.add(self._efforts.topic_name)
 
     @property

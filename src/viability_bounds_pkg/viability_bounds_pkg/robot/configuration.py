@@ -92,6 +92,9 @@ class RobotConfiguration:
             raise SettingError("locked_positions", positions, allowed)
         if not np.isfinite(positions).all():
             raise SettingError("locked_positions", positions, "finite numbers")
+        if len({*names, *self.joints}) < len(names) + len(self.joints):
+            allowed = "none of 'joints', each once"
+            raise SettingError("locked_joints", names, allowed)
         low, high = self.position_min, self.position_max
         if np.isposinf(low).any():
             raise SettingError("position_min", low, "numbers below .inf")
