@@ -149,7 +149,7 @@ def limits_from_worst_cases(
         if not (np.isfinite([low, high]).all() and low < 0 < high):
             raise LimitEstimateError(
                 f"joint {joint}: override must be finite with min < 0 < max, "
-                f"is ({low:g}, {high:g}) rad/s^2"
+                f"is ({low:g}, {high:g})"
             )
     if not cap > 0.0:
         raise LimitEstimateError(f"cap must be positive, is {cap:g}")
@@ -162,6 +162,11 @@ def limits_from_worst_cases(
     return AccelerationLimits(names, a_min, a_max, worst, frozenset(overrides))
 
 
+_PER = "/s", "/s^2"
+_FORCE = {"rad": "N m", "m": "N"}
+"""Unit of a joint's torque, or force, by that of its position."""
+
+
 def _empty_interval(
     model: pin.Model, space: StateSpace, worst: WorstCases, j: int, overrides: Container[str]
 ) -> EmptyIntervalError:
@@ -171,25 +176,35 @@ def _empty_interval(
     if worst.a_max[j] <= 0:
         side, limit, value = 0, "a_max", worst.a_max[j]
     found = largest_velocity_scale(model, space, ignore=overrides)
+    units = [_unit(model, k) for k in range(model.nv)]
+    speed, acceleration = (" or ".join(dict.fromkeys(u + per for u in units)) for per in _PER)
     remedy = (
         f"velocity limits scaled by {found.scale:.3f}, to {_text(found.scale * space.v_max)} "
-        f"rad/s, leave every joint {USEFUL_ACCELERATION:g} rad/s^2 either way; else"
+        f"{speed}, leave every joint {USEFUL_ACCELERATION:g} {acceleration} either way; else"
     )
     if found.scale == 0.0:
         gravity = pin.computeGeneralizedGravity(model, model.createData(), found.q)
-        weight = abs(gravity[list(model.names).index(found.joint) - 1])
+        k = list(model.names).index(found.joint) - 1
+        weight = f"{abs(gravity[k]):.3g} {_FORCE[units[k]]}"
         remedy = (
-            f"lower velocities do not help: joint {found.joint} takes {weight:.3g} N m just to "
-            f"hold still at q = {_text(found.q)};"
+            f"lower velocities do not help: joint {found.joint} takes {weight} just to hold "
+            f"still at q = {_text(found.q)};"
         )
+    unit = units[j]
     message = (
-        f"joint {joint}: its torque of {space.tau_max[j]:.4g} N m leaves no acceleration "
-        f"interval: {limit} = {value:.3g} rad/s^2 at q = {_text(worst.q[side, j])}, "
-        f"v = {_text(worst.v[side, j])}; {remedy} narrow the position limits or override the "
-        f"joint's acceleration limits (--override {joint}=MIN,MAX), or take those of most states, "
-        "with the controller's safety_filter (--share)"
+        f"joint {joint}: its torque of {space.tau_max[j]:.4g} {_FORCE[unit]} leaves no "
+        f"acceleration interval: {limit} = {value:.3g} {unit}/s^2 at "
+        f"q = {_text(worst.q[side, j])}, v = {_text(worst.v[side, j])}; {remedy} narrow the "
+        f"position limits or override the joint's acceleration limits (--override "
+        f"{joint}=MIN,MAX), or take those of most states, with the controller's safety_filter "
+        "(--share)"
     )
     return EmptyIntervalError(message, joint, found.scale)
+
+
+def _unit(model: pin.Model, joint: int) -> str:
+    slides = model.joints[1 + joint].shortname().startswith("JointModelP")
+    return "m" if slides else "rad"
 
 
 def _text(values: Array) -> str:

@@ -36,7 +36,7 @@ from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import check_writable, write_whole
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter_files import ParameterFileError, read_files
-from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration
+from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration, units_of
 
 Array = NDArray[np.float64]
 
@@ -57,6 +57,7 @@ def excitation(
     dt: float,
     amplitude: float = 0.6,
     speed: float = 0.5,
+    units: Sequence[str] = (),
 ) -> tuple[Array, Array]:
     """Return positions and velocities, shape (N, n), rad and rad/s, at the period `dt`, s.
 
@@ -68,17 +69,21 @@ def excitation(
         dt: period, s.
         amplitude: greatest A, rad.
         speed: greatest share of the velocity limits.
+        units: of the joints' positions; rad if not given.
 
     Raises:
         ExcitationError: a joint starts outside its limits or too near to both.
     """
     q_min, q_max, v_max = arm.position_min, arm.position_max, arm.velocity_max
     room = np.maximum(q_max - q_start, q_start - q_min)
-    for joint, q, low, high, most in zip(arm.joints, q_start, q_min, q_max, room, strict=True):
+    units = units or ["rad"] * len(arm.joints)
+    for joint, unit, q, low, high, most in zip(
+        arm.joints, units, q_start, q_min, q_max, room, strict=True
+    ):
         if not low <= q <= high:
             raise ExcitationError(f"joint {joint} starts at {q:g}, outside its limits")
         if ROOM * most < 0.05:
-            raise ExcitationError(f"joint {joint} has {most:.3g} rad of room only")
+            raise ExcitationError(f"joint {joint} has {most:.3g} {unit} of room only")
     side = np.where(q_max - q_start >= q_start - q_min, 1.0, -1.0)
     largest = np.minimum(amplitude, ROOM * room)
     q, v = [], []
@@ -112,7 +117,8 @@ def _run(options: argparse.Namespace) -> int:
     if options.output.resolve() == options.parameters.resolve():
         raise ParameterFileError(f"{options.output} is read, and cannot be written too")
     config = read_files(BulletConfiguration, [options.parameters], "/**/bullet_node")
-    motion = excitation(config, config.start_positions, config.dt)
+    units = units_of(config.urdf, config.joints)
+    motion = excitation(config, config.start_positions, config.dt, units=units)
     with closing(make_robot(config)) as robot:
         recorded, monitor = record(robot, config, *motion)
     broken = np.flatnonzero(

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from arms import load_arm
 
-from torque_safety_controller.friction.identification import friction_model, identify
+from torque_safety_controller.friction.identification import JointFit, friction_model, identify
 from torque_safety_controller.friction.joint_recording import (
     Recording,
     RecordingError,
@@ -18,7 +18,7 @@ from torque_safety_controller.friction.joint_recording import (
     make_blocks,
 )
 from torque_safety_controller.friction.settings import FrictionModel
-from torque_safety_controller.tools.identify_friction import main
+from torque_safety_controller.tools.identify_friction import main, report
 from viability_bounds_pkg.testing.executables import called
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
@@ -290,3 +290,11 @@ def test_what_cannot_be_done_is_told_in_one_line_and_leaves_files_alone(recordin
     assert ended.returncode == 1
     assert ended.stderr.strip().endswith("tells nothing about friction: see above")
     assert not output.exists()
+
+
+def test_slides_have_units_of_their_own(capsys):
+    report(["lift", "elbow"], [JointFit(errors=np.zeros(4))] * 2, ["m", "rad"])
+    lift, elbow = capsys.readouterr().out.split("elbow: ")
+    units = [line.split("+- 0 ")[1] for line in lift.splitlines()[1:]]
+    assert units == ["N", "N", "N s/m", "m/s"]
+    assert "rad" not in lift and "N m s/rad" in elbow

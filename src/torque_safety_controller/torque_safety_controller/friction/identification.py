@@ -203,9 +203,7 @@ def _fill(fit: JointFit, data: JointRegression, standing: float) -> None:
     if 1 in kept and data.slower(0.5 * v_s) >= _FEWEST_SLOW:
         fit.stribeck_velocity = v_s
     elif 1 in kept:
-        fit.notes.append(
-            f"stiction not told: the motion was hardly ever slower than {0.5 * v_s:.2g} rad/s"
-        )
+        fit.notes.append(f"stiction not told: the speed was hardly ever below {0.5 * v_s:.2g}")
         fit.static, fit.errors[1], fit.errors[3] = fit.coulomb, fit.errors[0], np.nan
 
 

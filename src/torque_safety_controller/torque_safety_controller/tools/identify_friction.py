@@ -32,7 +32,11 @@ from viability_bounds_pkg.parameter_files import ParameterFileError
 NODE = "/**/controller_node"
 """Node that the written parameters are for."""
 
-_UNITS = ("N m", "N m", "N m s/rad", "rad/s")
+_UNITS = {
+    "rad": ("N m", "N m", "N m s/rad", "rad/s"),
+    "m": ("N", "N", "N s/m", "m/s"),
+}
+"""Of the coefficients, by that of the joint's position."""
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -70,10 +74,10 @@ def _run(options: argparse.Namespace) -> int:
         fits = list(bar)
     except RecordingError as error:
         raise RecordingError(f"{options.recording}: {error}") from error
-    report(names, fits)
+    report(names, fits, robot.units)
     if not any(fit.static > 0.0 or fit.viscous > 0.0 for fit in fits):
         raise RecordingError(f"{options.recording} tells nothing about friction: see above")
-    text = overlay_text(names, fits, options)
+    text = overlay_text(names, fits, robot.units, options)
     if options.output is None:
         print("\n" + text, end="")
     else:
@@ -85,23 +89,31 @@ def _run(options: argparse.Namespace) -> int:
 def _check_positions(path: Path, names: Sequence[str], q: Array, robot: Robot) -> None:
     """Refuse positions that the joints cannot have, shape (N, n), rad."""
     low, high, width = robot.q_min, robot.q_max, robot.q_max - robot.q_min
-    for name, column, least, most in zip(names, q.T, low - width, high + width, strict=True):
+    limits = low - width, high + width, robot.units
+    for name, column, least, most, unit in zip(names, q.T, *limits, strict=True):
         for value in (column.min(), column.max()):
             if not least <= value <= most:
                 raise RecordingError(
-                    f"{path}: {name} is at {value:.3g} rad, beyond its limits by more than its "
+                    f"{path}: {name} is at {value:.3g} {unit}, beyond its limits by more than its "
                     "range: degrees, or another robot?"
                 )
 
 
-def report(names: Sequence[str], fits: Sequence[JointFit]) -> None:
-    """Print the identified coefficients with standard errors, and the notes."""
-    for name, fit in zip(names, fits, strict=True):
+def report(names: Sequence[str], fits: Sequence[JointFit], kinds: Sequence[str]) -> None:
+    """Print the identified coefficients with standard errors, and the notes.
+
+    Args:
+        names: of the joints.
+        fits: of these.
+        kinds: units of their positions.
+    """
+    for name, fit, kind in zip(names, fits, kinds, strict=True):
+        units = _UNITS[kind]
         print(
-            f"{name}: {fit.blocks} blocks, {fit.speeds[0]:.2g} to {fit.speeds[1]:.2g} rad/s, "
-            f"residual {fit.residual:.2g} N m"
+            f"{name}: {fit.blocks} blocks, {fit.speeds[0]:.2g} to {fit.speeds[1]:.2g} {units[3]}, "
+            f"residual {fit.residual:.2g} {units[0]}"
         )
-        for what, error, unit in zip(COEFFICIENTS, fit.errors, _UNITS, strict=True):
+        for what, error, unit in zip(COEFFICIENTS, fit.errors, units, strict=True):
             if np.isfinite(error):
                 print(f"  {what:18}{getattr(fit, what):10.4g} +- {error:.2g} {unit}")
         for note in fit.notes:
@@ -109,13 +121,16 @@ def report(names: Sequence[str], fits: Sequence[JointFit]) -> None:
 
 
 def overlay_text(
-    names: Sequence[str], fits: Sequence[JointFit], options: argparse.Namespace
+    names: Sequence[str],
+    fits: Sequence[JointFit],
+    kinds: Sequence[str],
+    options: argparse.Namespace,
 ) -> str:
     """Return the text of the parameter file; it does not switch the compensation on or off."""
     notes = [
         f"Friction found by identify_friction in {options.recording.name}, to be passed as a "
         f"parameter file after {options.parameters.name}",
-        ", ".join(dict.fromkeys(_UNITS)),
+        "; of slides ".join(", ".join(dict.fromkeys(_UNITS[k])) for k in _UNITS if k in kinds),
     ]
     notes += [
         f"{name}: {note}" for name, fit in zip(names, fits, strict=True) for note in fit.notes

@@ -124,6 +124,13 @@ def test_limits_of_most_states_where_there_are_none_for_all(write_robot, call):
     assert "override, NOT available in 60 % of random states" in ended.stdout
 
 
+def test_slides_have_units_of_their_own(write_robot, call):
+    ended = call(write_robot(type="prismatic"), "--samples", 300, "--cap", 5, "--drift")
+    assert re.search(r"shoulder: torque leaves \[.*\] m/s\^2", ended.stdout)
+    assert "shoulder: a in [-5, 5] m/s^2 (capped)" in ended.stdout
+    assert "# rad/s^2, m/s^2 of slides, drift in rad/s^3, m/s^3 of slides" in ended.stdout
+
+
 def test_too_much_speed_for_the_torque(write_robot, call):
     """Joint, state, lower velocities and the override: all that is offered helps."""
     fast = "    velocity_max: [40.0, 40.0]\n    torque_max: [30.0, 10.0]"

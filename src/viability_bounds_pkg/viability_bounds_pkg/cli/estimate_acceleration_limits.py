@@ -36,6 +36,7 @@ from viability_bounds_pkg.cli.limits_file import (
 from viability_bounds_pkg.estimate.drift import acceleration_drift
 from viability_bounds_pkg.estimate.worst_case import Array, StateSpace, WorstCases
 from viability_bounds_pkg.parameter_files import ParameterFileError
+from viability_bounds_pkg.robot.configuration import list_units
 
 
 def _count(text: str) -> int:
@@ -111,7 +112,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         type=positive,
         default=np.inf,
         metavar="VALUE",
-        help="greatest limit of all joints, rad/s^2",
+        help="greatest limit of all joints, rad/s^2 or m/s^2",
     )
     add(
         "--drift",
@@ -151,11 +152,11 @@ def _run(options: argparse.Namespace) -> int:
     space = StateSpace.of(robot.model, robot.q_min, robot.q_max, robot.v_max, torque)
     search = SEARCHES[options.method]
     worst = search(robot.model, space, options.samples, options.seed)
-    _report_search(names, worst)
+    _report_search(names, robot.units, worst)
     if options.share > 0.0:
         overrides = _in_share(robot, space, worst, options.share) | overrides
     limits = limits_from_worst_cases(robot.model, space, worst, overrides, options.cap)
-    _report_limits(limits, unavailable_share(robot.model, space, limits))
+    _report_limits(limits, robot.units, unavailable_share(robot.model, space, limits))
     drift = None
     if options.drift:
         print("searching for the worst drift of a held torque ...", flush=True)
@@ -167,6 +168,7 @@ def _run(options: argparse.Namespace) -> int:
         f"{options.parameters.name}",
         f"method {options.method}, {worst.evaluations} evaluations, seed {options.seed}, "
         f"torque reserve {options.torque_reserve:g}",
+        f"{list_units(robot.units, '/s^2')}, drift in {list_units(robot.units, '/s^3')}",
     ]
     text = overlay_text(limits, drift, origin)
     if options.output is None:
@@ -182,25 +184,26 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _report_search(names: Sequence[str], worst: WorstCases) -> None:
+def _report_search(names: Sequence[str], units: Sequence[str], worst: WorstCases) -> None:
     """Print the worst states of each joint."""
-    for j, name in enumerate(names):
-        print(f"{name}: torque leaves [{worst.a_min[j]:.4g}, {worst.a_max[j]:.4g}] rad/s^2")
+    for j, (name, unit) in enumerate(zip(names, units, strict=True)):
+        print(f"{name}: torque leaves [{worst.a_min[j]:.4g}, {worst.a_max[j]:.4g}] {unit}/s^2")
         for side, limit in ((1, "a_min"), (0, "a_max")):
             q, v = worst.q[side, j], worst.v[side, j]
             print(f"  worst {limit} at q = {_vector(q)}, v = {_vector(v)}")
     print(f"{worst.evaluations} evaluations of the dynamics\n")
 
 
-def _report_limits(limits: AccelerationLimits, unavailable: Array) -> None:
+def _report_limits(limits: AccelerationLimits, units: Sequence[str], unavailable: Array) -> None:
     """Print the limits to use, and where each comes from.
 
     Args:
         limits: what to use.
+        units: of the joints' positions.
         unavailable: share of states in which torque does not allow them, shape (n,).
     """
     found = limits.worst
-    for j, name in enumerate(limits.names):
+    for j, (name, unit) in enumerate(zip(limits.names, units, strict=True)):
         low, high = limits.a_min[j], limits.a_max[j]
         if name in limits.overridden:
             origin = "override"
@@ -208,7 +211,7 @@ def _report_limits(limits: AccelerationLimits, unavailable: Array) -> None:
                 origin += f", NOT available in {100.0 * unavailable[j]:.2g} % of random states"
         else:
             origin = "found" if (low, high) == (found.a_min[j], found.a_max[j]) else "capped"
-        print(f"{name}: a in [{low:.4g}, {high:.4g}] rad/s^2 ({origin})")
+        print(f"{name}: a in [{low:.4g}, {high:.4g}] {unit}/s^2 ({origin})")
 
 
 def _vector(values: Array) -> str:
@@ -221,9 +224,9 @@ def overlay_text(limits: AccelerationLimits, drift: Array | None, origin: Sequen
     Args:
         limits: what to write.
         drift: ``acceleration_drift``, shape (n,), rad/s^3, if it was searched.
-        origin: lines of comment that say where the limits come from.
+        origin: lines of comment that say where the limits come from, and their units.
     """
-    notes = [*origin, "rad/s^2, drift in rad/s^3"]
+    notes = [*origin]
     if limits.overridden:
         notes.append(f"set by hand: {', '.join(sorted(limits.overridden))}")
     found = {

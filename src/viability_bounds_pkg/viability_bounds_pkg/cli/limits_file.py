@@ -17,7 +17,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.parameter_files import read_files
-from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration
+from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration, units_of
 from viability_bounds_pkg.robot.description import build_model
 
 Array = NDArray[np.float64]
@@ -42,6 +42,7 @@ class Robot:
         q_max: upper position limits, shape (n,), rad.
         v_max: velocity limits, shape (n,), rad/s.
         tau_max: torque limits, shape (n,), N m.
+        units: of the joints' positions, n of them.
     """
 
     model: pin.Model
@@ -49,6 +50,7 @@ class Robot:
     q_max: Array
     v_max: Array
     tau_max: Array
+    units: Sequence[str]
 
 
 def read_robot(path: Path) -> Robot:
@@ -67,9 +69,14 @@ def read_robot(path: Path) -> Robot:
         RobotDescriptionError: it cannot be loaded, or lacks a joint; a rotor inertia is negative.
     """
     config = read_files(LimitedRobotConfiguration, [path], NODE)
-    model = build_model(config.read_urdf(), config.joints, config.locked, config.rotor_inertia)
+    urdf = config.read_urdf()
     return Robot(
-        model, config.position_min, config.position_max, config.velocity_max, config.torque_max
+        build_model(urdf, config.joints, config.locked, config.rotor_inertia),
+        config.position_min,
+        config.position_max,
+        config.velocity_max,
+        config.torque_max,
+        units_of(urdf, config.joints),
     )
 
 

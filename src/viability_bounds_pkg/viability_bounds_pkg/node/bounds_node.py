@@ -99,8 +99,8 @@ class BoundsNode(ArmNode):
             if not full:
                 self.get_logger().warning(
                     f"joint '{name}' can cross its range or exceed its speed within one braking "
-                    f"step (condition (11)); its bounds count on {up:.3g} rad/s^2 before the "
-                    f"upper limit and {low:.3g} rad/s^2 before the lower one"
+                    f"step (condition (11)); its bounds count on decelerations of {up:.3g} before "
+                    f"the upper limit and {low:.3g} before the lower one"
                 )
 
     def _on_state(self, message: JointState) -> None:

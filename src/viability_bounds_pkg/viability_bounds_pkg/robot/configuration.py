@@ -226,6 +226,12 @@ def units_of(urdf: str, joints: Sequence[str]) -> list[str]:
     return ["m" if kind == "prismatic" else "rad" for kind in kinds]
 
 
+def list_units(units: Sequence[str], per: str = "") -> str:
+    """Return the unit of all joints, such as "rad/s, m/s of slides", from that of each."""
+    kinds = [f"{unit}{per}" for unit in ("rad", "m") if unit in units]
+    return f"{', '.join(kinds)} of slides" if len(kinds) > 1 else kinds[0]
+
+
 def _limit(joint: ElementTree.Element, key: str) -> float | None:
     """Return a limit of a joint of a URDF, None where there is none to use."""
     if joint.get("type") == "continuous" and key in ("lower", "upper"):
