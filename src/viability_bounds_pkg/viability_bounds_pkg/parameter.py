@@ -186,7 +186,9 @@ def _is_sequence(value: Any) -> bool:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    if isinstance(value, int) and not isinstance(value, bool):
+        return abs(value) < 10**300  # which a float can hold
+    return isinstance(value, float)
 
 
 _PARAMETER, _GROUP = "parameter", "group"

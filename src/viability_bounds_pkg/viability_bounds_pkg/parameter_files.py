@@ -120,7 +120,7 @@ def _sections(content: Any, path: str, section: str = "") -> Iterator[tuple[str,
             place = f"'{key}' of '{section}'" if section else f"'{key}'"
             raise ParameterFileError(f"{path}: {place} is not below '{_VALUES}'; {form}")
         if key == _VALUES:
-            yield section, value
+            yield section, {str(name): each for name, each in value.items()}
         else:
             yield from _sections(value, path, f"{section}/{str(key).strip('/')}")
 

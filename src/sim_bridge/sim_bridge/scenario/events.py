@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from sim_bridge.scenario.fields import (
     vector,
 )
 from viability_bounds_pkg.exceptions import did_you_mean
+from viability_bounds_pkg.parameter import Range, above
 from viability_bounds_pkg.parameter_files import NODES, unknown_parameters
 from viability_bounds_pkg.pose_trajectory import (
     PoseTrajectory,
@@ -271,8 +273,8 @@ _CIRCLE: dict[str, Check] = {
     "diameter": positive,
     "plane": _plane,
     "phase": number,
-    "turns": positive,
-    "period": positive,
+    "turns": partial(number, allowed=above(0.0, 1e3)),
+    "period": partial(number, allowed=Range(1e-3, 1e6)),
 }
 _OBSTACLE: dict[str, Check] = {
     "name": name,

@@ -105,6 +105,8 @@ def circle(before="", after=""):
         ("trajectory", points(POINT, TURNED), "points[1] is turned by 3.14 rad from the last one"),
         ("trajectory", circle("r: 1", "r: -1"), "circle.diameter"),
         ("trajectory", circle("[y, z]", "[y, -y]"), "circle.plane"),
+        ("trajectory", circle("period: 1", "period: 1.0e-300"), "circle.period"),
+        ("trajectory", circle("period: 1", "period: 1, turns: 1.0e9"), "circle.turns"),
         ("wrench", "{force: [1, 2]}", "wrench.force"),
         ("obstacle", f"{{{BOX.replace('box', 'cone')}}}", "none of box, sphere, cylinder"),
         ("remove_obstacle", "{name: a}", "names 'a'; there are: none"),

@@ -172,6 +172,7 @@ def test_bad_robots_are_told_in_one_line(write_robot, call, case, message):
     ("option", "value", "message"),
     [
         ("--samples", "0", "must be at least 1, is 0"),
+        ("--samples", "inf", "must be at least 1, is inf"),
         ("--torque-reserve", "1", "must be at least 0 and less than 1"),
         ("--override", "wrist", "must read JOINT=MIN,MAX"),
         ("--cap", "-2", "must be positive"),

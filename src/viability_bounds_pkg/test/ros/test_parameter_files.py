@@ -91,6 +91,13 @@ def test_a_node_starts_with_what_was_given_and_forgets_null(ros):
     assert node.get_parameter("locked_joints").type_ == Parameter.Type.NOT_SET
 
 
+def test_a_name_that_yaml_takes_for_something_else_is_unknown(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("/**: {ros__parameters: {1: 2, on: 3}}")
+    with pytest.raises(ParameterFileError, match="'1'.*'True'"):
+        node_parameters([path], "bounds_node")
+
+
 def test_yaml_is_read_as_rcl_reads_it():
     text = "{a: 1e-3, b: -.5, c: .inf, d: [1, 2], e: null, f: '1', g: true, h: package://a/b}"
     values = {"a": 1e-3, "b": -0.5, "c": math.inf, "d": [1, 2], "e": None, "f": "1", "g": True}

@@ -118,6 +118,7 @@ def test_values_and_defaults_arrive_and_whole_numbers_count_as_floats(ros):
         ),
         ({"extra": [1.0, math.nan]}, "parameter 'extra' is [1, nan]; allowed: numbers, not NaN"),
         ({"rate": 0.0}, "parameter 'rate' is 0; allowed: a number > 0 and <= 1000"),
+        ({"rate": 10**400}, f"parameter 'rate' is {10**400}; allowed: a number"),
         ({"rate": math.nan}, "parameter 'rate' is nan; allowed: a number > 0 and <= 1000"),
         ({"gain": 0.5}, "parameter 'offset' is 1; allowed: less than gain"),
     ],

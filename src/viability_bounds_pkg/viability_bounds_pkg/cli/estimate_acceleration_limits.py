@@ -40,10 +40,10 @@ from viability_bounds_pkg.robot.configuration import list_units
 
 
 def _count(text: str) -> int:
-    value = int(number(text))
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, is {value}")
-    return value
+    value = number(text)
+    if not 1.0 <= value < np.inf:
+        raise argparse.ArgumentTypeError(f"must be at least 1, is {text}")
+    return int(value)
 
 
 def _fraction(text: str) -> float:
