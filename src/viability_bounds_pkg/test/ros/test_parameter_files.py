@@ -93,8 +93,8 @@ def test_a_node_starts_with_what_was_given_and_forgets_null(ros):
 
 def test_a_name_that_yaml_takes_for_something_else_is_unknown(tmp_path):
     path = tmp_path / "a.yaml"
-    path.write_text("/**: {ros__parameters: {1: 2, on: 3}}")
-    with pytest.raises(ParameterFileError, match="'1'.*'True'"):
+    path.write_text("/**: {ros__parameters: {1: 2, off: 3}}")
+    with pytest.raises(ParameterFileError, match="'1'.*'False'"):
         node_parameters([path], "bounds_node")
 
 
