@@ -73,7 +73,7 @@ class DirectLoop:
         bounds = self._configuration("bounds_node", BoundsConfiguration)
         self.limits = bounds.limits
         self.bounds = make_bounds(bounds)
-        self.controller, _ = assembly.make_controller(
+        self.controller, *_ = assembly.make_controller(
             self._controller_configuration(), declared=bounds
         )
         self.sensing = True

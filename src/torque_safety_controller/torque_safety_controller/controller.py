@@ -79,7 +79,7 @@ class Controller:
             part.configure(settings)
 
     def remodel(self) -> None:
-        """Go by a model whose masses have changed from the next step on."""
+        """Go by a model whose masses or placements have changed from the next step on."""
         for part in self.parts:
             part.remodel(self.robot)
 

@@ -110,6 +110,12 @@ CAUSES = {
         Goals.SLOWED,
         "several nodes publish goals",
     ),
+    "moved": Cause(
+        "a locked joint before the hand moves, at 0.05 rad/s or m/s or more",
+        "it has been slower for 0.5 s",
+        Mode.HOLD,
+        Goals.SLOWED,
+    ),
     "no goal": Cause("there is no goal", "a goal", Mode.HOLD, Goals.ASIDE, "no goal"),
     "moves": Cause(
         "one of the above has set the share to 0; states were missing, or not answered for "

@@ -142,7 +142,7 @@ class Part:
         """Forget the past: the arm may be elsewhere. `robot` is updated to its state."""
 
     def remodel(self, robot: RobotModel) -> None:
-        """Go by a model whose masses have changed from the next step on."""
+        """Go by a model whose masses or placements have changed from the next step on."""
 
     def prepare(self, step: Step) -> None:
         """Add tasks, rows, torque or forces to a step, or narrow its bounds."""

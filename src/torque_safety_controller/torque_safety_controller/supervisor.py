@@ -143,6 +143,7 @@ class Supervisor:
         effort: Array | None,
         limits: bool = True,
         goal: str = "",
+        moved: str = "",
     ) -> Order:
         """A usable state is to be answered: return the order for that.
 
@@ -152,12 +153,15 @@ class Supervisor:
             effort: torque of the motors, shape (n,), N m; None if it is not known.
             limits: whether the state's acceleration limits are there.
             goal: cause not to serve goals; empty for none.
+            moved: which locked joint moves, in words; empty for none.
         """
         causes = self._causes
-        for ended in ("silent", "refused", "rival", "no goal", "stale"):
+        for ended in ("silent", "refused", "rival", "moved", "no goal", "stale"):
             causes.pop(ended, None)
         if goal:
             self._raise(goal)
+        if moved:
+            self._raise("moved", moved)
         if not limits and self.control is not Control.POSITION:
             self._raise("stale")
             self.change("failed", f"handover failed: {CAUSES['stale'].reason}")

@@ -41,8 +41,15 @@ from viability_bounds_pkg.robot.configuration import (
 )
 from viability_bounds_pkg.robot.description import frame_id
 from viability_bounds_pkg.robot.files import RobotDescriptionError
+from viability_bounds_pkg.robot.locked_joints import LockedJoints
+from viability_bounds_pkg.robot.payload import Payload
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import JointStateReader, pose_message, wrench_message
+from viability_bounds_pkg.ros.messages import (
+    Arrival,
+    JointStateReader,
+    pose_message,
+    wrench_message,
+)
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import node_parser, run_together
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf
@@ -173,7 +180,10 @@ class ViewerNode(ArmNode):
         with self.starting():
             config = NodeParameters(self, ViewerConfiguration).configuration
             urdf = robot_urdf(config, self)
-            self.page = _make_page(config, urdf)
+            model = load_model(config, urdf)
+            self.page = _make_page(config, urdf, model)
+            frames = config.end_effectors, config.base_frame
+            self._locked = LockedJoints(config, urdf, model, Payload(model), *frames)
         self._units = units_of(urdf, config.joints)
         self._reader = JointStateReader(config.joints, warn=self._warn)
         self._unknown = np.full(len(config.joints), math.nan)
@@ -260,7 +270,9 @@ class ViewerNode(ArmNode):
         return "  \n".join(lines)
 
     def _on_state(self, message: JointState) -> None:
-        self._reader.read(message, time.monotonic())
+        arrival = self._reader.read(message, time.monotonic())
+        if arrival is not Arrival.REFUSED and self._locked.due(self._reader.stamp):
+            self._locked.look(message.name, message.position, self._reader.stamp)
 
     def _on_limits(self, message: JointTrajectory) -> None:
         limits = [np.array(point.accelerations) for point in message.points]
@@ -306,8 +318,7 @@ def passed_limits(robot: Mapping[str, str], units: Sequence[str]) -> dict[str, f
     return beyond
 
 
-def _make_page(config: ViewerConfiguration, urdf: str) -> Page:
-    model = load_model(config, urdf)
+def _make_page(config: ViewerConfiguration, urdf: str, model: pin.Model) -> Page:
     frames = config.base_frame, config.end_effectors[0]
     for name, frame in zip(("base_frame", "end_effector_frame"), frames, strict=True):
         try:

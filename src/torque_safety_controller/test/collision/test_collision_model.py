@@ -9,11 +9,14 @@ import yaml
 from torque_safety_controller.new_robot.capsules import fitted_capsule, link_capsules
 from torque_safety_controller.node.assembly import make_collision
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tools.fit_capsules import main
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.robot.description import build_model, load_geometry
+from viability_bounds_pkg.robot.locked_joints import LockedJoints
+from viability_bounds_pkg.robot.payload import Payload
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
 PANDA = read_config("panda", "controller_node")
@@ -182,3 +185,27 @@ def test_what_cannot_be_is_refused_by_the_name_of_the_parameter(changes, name, a
         load(**changes)
     assert error.value.name == name
     assert allowed in error.value.allowed
+
+
+def test_shapes_follow_a_torso_that_the_model_has_locked():
+    """Those of the arm, and those of links that it does not move."""
+    values = read_config("talos_left_arm", "controller_node")
+    n = len(values["joints"])
+    values = {k: v[2:] if isinstance(v, list) and len(v) == n else v for k, v in values.items()}
+    values |= {"collision_avoidance": True, "obstacles": THINGS}
+    config, torso = read(ControllerConfiguration, values), ["torso_1_joint", "torso_2_joint"]
+    model, urdf = load_model(config, config.read_urdf()), config.read_urdf()
+    found = make_collision(config, model)
+    locked = LockedJoints(config, urdf, model, Payload(model), config.end_effectors)
+    assert locked.look(torso, [0.3, 0.4], 1)
+    found.remodel(RobotModel(model, config.end_effectors[0], 1e-3))
+    values["locked_joints"] += torso
+    values["locked_positions"] += [0.3, 0.4]
+    config = read(ControllerConfiguration, values)
+    expected = make_collision(config, load_model(config, urdf))
+    links = len(config.collision.capsules)
+    for name in ("joint", "radius", "ends", "boxes"):
+        one, other = (getattr(each.model.segments, name) for each in (found, expected))
+        np.testing.assert_allclose(one, other, atol=1e-9)
+    still = found.model.segments.joint[:links] == 0
+    assert still.any() and not still.all()

@@ -59,6 +59,7 @@ BEGINS = {
     "giving back": lambda c: (c.supervisor.enable(False), c.answer(v=MOVES)),
     "no plan": lambda c: c.answer(planned=False),
     "rival": lambda c: c.answer(goal="rival"),
+    "moved": lambda c: c.answer(moved="the lift moves"),
     "no goal": lambda c: c.answer(goal="no goal"),
     "moves": lambda c: (c.supervisor.robot_returned("why"), c.answer(None, v=MOVES)),
     "drives": lambda c: (c.supervisor.enable(False), c.answer()),
@@ -75,7 +76,7 @@ def test_without_usable_states_nothing_is_sent_and_without_a_solution_goals_do_n
     stops = {name for name, cause in CAUSES.items() if cause.mode is Mode.STOPPED}
     slows = {name for name, cause in CAUSES.items() if cause.goals is Goals.SLOWED}
     assert stops == {"silent", "refused"}
-    assert slows == {"refused", "failed", "stale", "rival", "moves"}
+    assert slows == {"refused", "failed", "stale", "rival", "moved", "moves"}
     into_torque = {before for before, after in CHANGES.items() if after is Control.TORQUE}
     assert into_torque == {(Control.TAKING_OVER, "torque known"), (Control.GIVING_BACK, "enable")}
 

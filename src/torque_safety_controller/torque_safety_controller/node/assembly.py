@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,6 +36,7 @@ from viability_bounds_pkg.node.bounds_parameters import (
 from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.robot.description import frame_id, inertia_beyond
 from viability_bounds_pkg.robot.files import RobotDescriptionError
+from viability_bounds_pkg.robot.locked_joints import LockedJoints
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
 from viability_bounds_pkg.stop import MARGIN
 from viability_bounds_pkg.viability import BoundsSolver
@@ -53,11 +55,11 @@ def make_controller(
     config: ControllerConfiguration,
     node: Node | None = None,
     declared: BoundsConfiguration | None = None,
-) -> tuple[Controller, pin.SE3]:
-    """Return a controller, warmed up, and the placement of the base frame.
+) -> tuple[Controller, pin.SE3, LockedJoints]:
+    """Return a controller, warmed up, the placement of the base frame, and what keeps its model.
 
     Tasks and limits are in the root frame of the URDF; the placement converts what is in
-    ``base_frame``.
+    ``base_frame``. It is a part of the model: it changes where a locked joint moves the frame.
 
     Args:
         config: checked parameters.
@@ -86,7 +88,9 @@ def make_controller(
         config.gains.hold_kd,
     )
     controller.warm_up()
-    return controller, base.placement
+    frames = config.end_effectors, config.base_frame
+    locked = LockedJoints(config, urdf, model, robot.payload, *frames)
+    return controller, base.placement, locked
 
 
 def make_parts(
@@ -197,14 +201,15 @@ def make_collision(config: ControllerConfiguration, model: pin.Model) -> Collisi
     limited = model.copy()
     limited.lowerPositionLimit = config.position_min
     limited.upperPositionLimit = config.position_max
+    found = build_collision_model(
+        limited,
+        collision.capsules,
+        collision.posture(config),
+        collision.bodies,
+        config.base_frame,
+    )
     return Collision(
-        build_collision_model(
-            limited,
-            collision.capsules,
-            collision.posture(config),
-            collision.bodies,
-            config.base_frame,
-        ),
+        replace(found, arm=model),
         collision.acceleration_min,
         collision.acceleration_max,
         HORIZON * config.dt,

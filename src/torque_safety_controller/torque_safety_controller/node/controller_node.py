@@ -64,8 +64,8 @@ class ControllerNode(ArmNode):
             self._node_parameters = NodeParameters(self, ControllerConfiguration, self._configure)
             config = self._node_parameters.configuration
             declared = declared_robot(self)
-            self._controller, base = make_controller(config, self, declared)
-        self._config = config
+            self._controller, base, self._locked = make_controller(config, self, declared)
+        self._config, self._base = config, base
         self._handover = Handover(
             config.joints, config.position_min, config.position_max, config.torque_max, config.dt
         )
@@ -159,6 +159,7 @@ class ControllerNode(ArmNode):
                 self._commands.again(stamp)
             return
         if arrival is not Arrival.NEW:
+            self._look_at_locked()
             self._start_over(arrival)
         elif states.unseen and self._supervisor.by_drives:
             # They would jump to where the arm was held before, from where it has been put.
@@ -167,6 +168,20 @@ class ControllerNode(ArmNode):
             self._answer(stamp, self._limits.range)
         elif self._supervisor.control is Control.POSITION or self._supervisor.stale:
             self._answer(stamp, None)
+        if self._locked.due(states.stamp):
+            self._later(self._look_at_locked)
+
+    def _look_at_locked(self) -> None:
+        """Have the model follow joints that it has locked."""
+        states, locked = self._states, self._locked
+        if states.message is None:
+            return
+        before = self._base.copy()
+        if locked.look(states.message.name, states.message.position, states.stamp):
+            self._controller.remodel()
+            self._goals.base_moved(self._base * before.inverse())
+        for line in locked.news():
+            self.get_logger().info(line)
 
     def _on_limits(self, message: JointTrajectory) -> None:
         if not self._limits.read(message):
@@ -208,12 +223,15 @@ class ControllerNode(ArmNode):
 
     def _answer(self, stamp: Any, limits: AccelerationRange | None) -> None:
         """Answer the newest state, whose acceleration limits are there or do not come."""
-        states, supervisor, goal = self._states, self._supervisor, ""
+        states, supervisor, goal, moved = self._states, self._supervisor, "", ""
         state, elapsed = State(states.q, states.v), states.elapsed()
         if not supervisor.by_drives:
             self._goals.apply_due(states.stamp, state)
-            goal = self._goals.trouble
-        order = supervisor.state(elapsed, state.v, states.effort(), limits is not None, goal)
+            goal, moved = self._goals.trouble, self._locked.moving
+        if moved:
+            moved += " moves, which is locked in the model"
+        effort = states.effort()
+        order = supervisor.state(elapsed, state.v, effort, limits is not None, goal, moved)
         if supervisor.by_drives:
             self._hold(stamp)
             states.mark_answered()

@@ -57,6 +57,8 @@ Array = NDArray[np.float64]
 WAITING_MAX = 1000
 """So many goals may wait for their time."""
 
+_ROUNDING = 1e-9
+
 SAME_PERIOD = 1.0
 """Refusals in a row that differ in numbers only get a line this often, s."""
 
@@ -266,6 +268,14 @@ class GoalSubscriber:
         states = self._states
         motion.check_late(self._controller, State(states.q, states.v), states.stamp)
         self.motion = motion
+
+    def base_moved(self, motion: pin.SE3) -> None:
+        """Leave poses where they are in the base frame, which has moved in the root frame."""
+        if not motion.isIdentity(_ROUNDING):
+            if isinstance(self.motion, TrajectoryMotion):
+                self.motion = None
+                self.refuse(TARGET_TRAJECTORY, "base_frame has moved")
+            self._controller.goals.move_poses(motion)
 
     # Goals at rest
 

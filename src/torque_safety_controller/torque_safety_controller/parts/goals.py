@@ -131,6 +131,17 @@ class Goals(Part):
         """
         self.targets = replace(self.targets, q=q_des, v=v_des, a=a_des)
 
+    def move_poses(self, motion: pin.SE3) -> None:
+        """Move the poses of end effectors with the frame that they are given in.
+
+        Args:
+            motion: of that frame, in the URDF's root frame.
+        """
+        pose, *others = (
+            each and motion * each for each in (self.targets.pose, *self.targets.others)
+        )
+        self.targets = replace(self.targets, pose=pose, others=tuple(others))
+
     def release_pose(self) -> None:
         """Leave end effectors without a goal, so that the joints' one counts in full."""
         others = (None,) * len(self.targets.others)

@@ -21,6 +21,7 @@ from viability_bounds_pkg.robot.configuration import (
     LimitedRobotConfiguration,
     load_model,
 )
+from viability_bounds_pkg.robot.locked_joints import LockedJoints
 from viability_bounds_pkg.robot.payload import Payload
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
@@ -96,6 +97,8 @@ class EstimatorNode(ArmNode):
             warn_of_unusual(self, config, urdf)
             model = load_model(config, urdf)
             self._estimator = make_estimator(config, model)
+            payload = Payload(model)
+            self._locked = LockedJoints(config, urdf, model, payload)
         joints = config.joints
         self._joints = list(joints)
         self._observers = config.observers
@@ -116,7 +119,7 @@ class EstimatorNode(ArmNode):
         self._estimates = self.stream(ESTIMATED_JOINT_STATES)
         self.listen(JOINT_STATES, self._on_state)
         self.listen(JOINT_COMMANDS, self._on_command)
-        self._payload = PayloadSubscriber(self, Payload(model))
+        self._payload = PayloadSubscriber(self, payload)
         self._diagnostics = Diagnostics(self, self._report, self.publisher_watch)
         source = "estimated" if config.velocity_estimation else "as reported"
         lag = 1e3 * config.declared.motor_lag
@@ -139,6 +142,8 @@ class EstimatorNode(ArmNode):
             self._answer = reader.with_state(state)
             self._answered += 1
         self._estimates.publish(self._answer)
+        if self._locked.due(reader.stamp) and reader.message is not None:
+            self._locked.look(reader.message.name, reader.message.position, reader.stamp)
         if arrival is Arrival.NEW and self._estimator.resets.total() != self._restarts:
             self._tell_restart()
 

@@ -64,13 +64,12 @@ def build_model(
         RobotDescriptionError: an unknown joint, a planar or floating joint, an order that
             differs from the kinematic one, or rotor inertias that cannot be.
     """
-    urdf, continuous = _continuous_as_revolute(urdf)
-    full = _whole_model(urdf)
+    full, continuous = whole_model(urdf)
     for name in joints:
         if not full.existJointName(name):
             raise unknown_name("joint", name, list(full.names)[1:], "joints")
     locked = [i for i in range(1, full.njoints) if full.names[i] not in joints]
-    model, _ = _reduced(full, locked, _posture(full, locked_positions))
+    model, _ = _reduced(full, locked, posture(full, locked_positions))
     kept = list(model.names)[1:]
     for name, joint in zip(kept, list(model.joints)[1:], strict=True):
         if joint.nq != 1 or joint.nv != 1:
@@ -103,10 +102,20 @@ def _reduced(
     q: NDArray[np.float64],
     geometries: Sequence[pin.GeometryModel] = (),
 ) -> tuple[pin.Model, list[pin.GeometryModel]]:
-    """Return a model and geometries with joints locked.
+    """Return a model and geometries with joints locked; the joints of `full` get other names."""
+    tell_apart(full)
+    reduced, found = pin.buildReducedModel(full, list(geometries), locked, q)
+    for k, frame in enumerate(reduced.frames):
+        reduced.frames[k].name = frame.name.removesuffix(_OF_JOINT)
+    for i in range(1, reduced.njoints):
+        reduced.names[i] = reduced.names[i].removesuffix(_OF_JOINT)
+    return reduced, list(found)
 
-    Pinocchio looks for frames of joints by their names alone: meanwhile they get others, as links
-    may have the same. The model that is given keeps them.
+
+def tell_apart(full: pin.Model) -> None:
+    """Give joints other names, as links may have the same.
+
+    To lock joints Pinocchio looks for their frames by name alone.
     """
     joints = [
         k
@@ -117,12 +126,6 @@ def _reduced(
         full.frames[k].name += _OF_JOINT
     for i in range(1, full.njoints):
         full.names[i] += _OF_JOINT
-    reduced, found = pin.buildReducedModel(full, list(geometries), locked, q)
-    for k, frame in enumerate(reduced.frames):
-        reduced.frames[k].name = frame.name.removesuffix(_OF_JOINT)
-    for i in range(1, reduced.njoints):
-        reduced.names[i] = reduced.names[i].removesuffix(_OF_JOINT)
-    return reduced, list(found)
 
 
 def frame_id(model: pin.Model, name: str) -> int:
@@ -140,7 +143,7 @@ def frame_id(model: pin.Model, name: str) -> int:
     raise unknown_name("frame", name, dict.fromkeys(each.name for each in model.frames))
 
 
-def _posture(model: pin.Model, positions: Mapping[str, float] | None) -> NDArray[np.float64]:
+def posture(model: pin.Model, positions: Mapping[str, float] | None) -> NDArray[np.float64]:
     """Return coordinates of a model with joints at `positions`, rad, and the others at zero."""
     q = pin.neutral(model)
     for name, position in (positions or {}).items():
@@ -170,11 +173,11 @@ def inertia_beyond(
     Raises:
         RobotDescriptionError: no such link.
     """
-    model = pin.buildModelFromXML(_continuous_as_revolute(urdf)[0])
+    model, _ = whole_model(urdf)
     if not model.existFrame(frame, pin.FrameType.BODY):
         raise RobotDescriptionError(f"unknown link {frame!r}")
     data = model.createData()
-    pin.framesForwardKinematics(model, data, _posture(model, locked_positions))
+    pin.framesForwardKinematics(model, data, posture(model, locked_positions))
     root = model.getFrameId(frame, pin.FrameType.BODY)
     beyond = {root}
     total = pin.Inertia.Zero()
@@ -202,12 +205,18 @@ def kinematic_order(urdf: str, joints: Sequence[str]) -> tuple[str, ...]:
     Raises:
         RobotDescriptionError: the URDF does not load.
     """
-    return tuple(name for name in _whole_model(urdf).names if name in joints)
+    return tuple(name for name in whole_model(urdf)[0].names if name in joints)
 
 
-def _whole_model(urdf: str) -> pin.Model:
+def whole_model(urdf: str) -> tuple[pin.Model, set[str]]:
+    """Return the model of all joints, an angle each, and the names of those that are continuous.
+
+    Raises:
+        RobotDescriptionError: the URDF does not load.
+    """
+    urdf, continuous = _continuous_as_revolute(urdf)
     try:
-        return pin.buildModelFromXML(urdf)
+        return pin.buildModelFromXML(urdf), continuous
     except (ValueError, RuntimeError) as error:
         raise RobotDescriptionError(f"URDF does not load: {error}") from error
 
@@ -275,8 +284,8 @@ def load_geometry(
                 )
     kept = set(model.names)
     locked = [i for i in range(1, full.njoints) if full.names[i] not in kept]
-    posture = _posture(full, locked_positions)
-    reduced, (geometry,) = _reduced(full, locked, posture, [geometry])
+    q = posture(full, locked_positions)
+    reduced, (geometry,) = _reduced(full, locked, q, [geometry])
     if list(reduced.names) != list(model.names):
         raise RobotDescriptionError("the model was not made of this URDF")
     return geometry

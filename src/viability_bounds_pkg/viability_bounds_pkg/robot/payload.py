@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
@@ -42,7 +44,7 @@ class Payload:
 
     def __init__(self, model: pin.Model) -> None:
         self._model = model
-        self._bare = [each.copy() for each in model.inertias]
+        self._bare = _copies(model.inertias)
         self.link, self.inertia = "", pin.Inertia.Zero()
 
     def __str__(self) -> str:
@@ -77,6 +79,11 @@ class Payload:
         self._apply()
         return True
 
+    def rebase(self, inertias: Iterable[pin.Inertia]) -> None:
+        """Carry the load on other masses of the model's links, those of its joints in order."""
+        self._bare = _copies(inertias)
+        self._apply()
+
     def beyond(self, frame: str) -> pin.Inertia:
         """Return what of the load hangs on a frame without a joint between, in its axes."""
         frames, root = self._model.frames, frame_id(self._model, frame)
@@ -105,7 +112,7 @@ class Payload:
         if (far := np.linalg.norm(lever)) > FARTHEST:
             allowed = f"up to {FARTHEST:g} m"
             raise PayloadError("centre of mass", f"is {far:g} m from the link; allowed: {allowed}")
-        moments = np.linalg.eigvalsh(tensor)
+        moments: Array = np.linalg.eigvalsh(tensor)
         slack = moments_slack(moments)
         impossible = moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack
         if impossible or moments[2] > mass * FARTHEST**2 + slack:
@@ -121,3 +128,7 @@ class Payload:
             hint = did_you_mean(link, moving) or f": {', '.join(moving)}"
             raise PayloadError("frame_id", f"is {link!r}; allowed: a link that moves{hint}")
         return frame_id(self._model, link)
+
+
+def _copies(inertias: Iterable[pin.Inertia]) -> list[pin.Inertia]:
+    return [each.copy() for each in inertias]

@@ -119,6 +119,10 @@ class Collision(Part):
         self._relaxed_steps = self._not_viable_steps = 0
         self._trouble = ""
 
+    def remodel(self, robot: RobotModel) -> None:
+        """Place the shapes anew, those on links that the arm does not move as well."""
+        self.model.place()
+
     def reset(self, robot: RobotModel) -> None:
         """Count steps from here on."""
         self._relaxed_steps = self._not_viable_steps = 0

@@ -69,6 +69,8 @@ class CollisionModel:
 
     Attributes:
         arm: the arm's joints.
+        shapes: capsules of links, then obstacles.
+        frames: of the arm, that these are in, by index.
         segments: capsules, and what boxes consist of.
         candidates: distances of the pairs.
         moves: 1 for joints that move the first shape of a pair only, -1 the second only, shape
@@ -79,11 +81,18 @@ class CollisionModel:
     """
 
     arm: pin.Model
+    shapes: tuple[Shape, ...]
+    frames: tuple[int, ...]
     segments: Segments
     candidates: Candidates
     moves: Array
     names: tuple[str, ...]
     left_out: dict[str, list[str]]
+
+    def place(self) -> None:
+        """Place segments and boxes as the frames of the arm are placed now."""
+        ends, boxes = _placed(self.shapes, [self.arm.frames[k] for k in self.frames])
+        self.segments.ends[:], self.segments.boxes[:] = ends, boxes
 
 
 def build_collision_model(
@@ -110,9 +119,9 @@ def build_collision_model(
     Raises:
         SettingError: an unknown link; named as the node's parameter.
     """
-    frames = [_link_frame(model, shape.name) for shape in capsules]
-    root = model.frames[frame_id(model, base_frame)] if base_frame else model.frames[0]
-    frames += [root] * len(obstacles)
+    places = [_link_frame(model, shape.name) for shape in capsules]
+    places += [frame_id(model, base_frame) if base_frame else 0] * len(obstacles)
+    frames = [model.frames[k] for k in places]
     shapes = [*capsules, *obstacles]
     joints = [int(frame.parentJoint) for frame in frames]
     chosen = _link_pairs(model, joints[: len(capsules)])
@@ -152,6 +161,8 @@ def build_collision_model(
     segments, candidates = _tables(shapes, frames, [chosen[k] for k in kept])
     return CollisionModel(
         arm=model,
+        shapes=tuple(shapes),
+        frames=tuple(places),
         segments=segments,
         candidates=candidates,
         moves=(moved[first] - moved[second])[:, 1:].copy(),
@@ -160,9 +171,9 @@ def build_collision_model(
     )
 
 
-def _link_frame(model: pin.Model, link: str) -> pin.Frame:
+def _link_frame(model: pin.Model, link: str) -> int:
     if model.existFrame(link, pin.FrameType.BODY):
-        return model.frames[model.getFrameId(link, pin.FrameType.BODY)]
+        return int(model.getFrameId(link, pin.FrameType.BODY))
     links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     raise SettingError("collision_capsules", link, f"links of the URDF{did_you_mean(link, links)}")
 
@@ -195,20 +206,17 @@ def _tables(
 ) -> tuple[Segments, Candidates]:
     """Return segments, one for each shape and then those of edges, and the distances of pairs."""
     joint = [int(frame.parentJoint) for frame in frames]
-    ends = [shape.ends(frame.placement) for shape, frame in zip(shapes, frames, strict=True)]
+    ends, boxes = _placed(shapes, frames)
     radius = [shape.radius for shape in shapes]
-    boxes: list[list[Array]] = []
-    box_of, edges_of = {}, {}
+    box_of: dict[int, int] = {}
+    edges_of = {}
     for index, shape in enumerate(shapes):
         if shape.is_box:
-            middle = frames[index].placement * shape.placement
-            edges = shape.edges(frames[index].placement)
-            box_of[index] = len(boxes)
-            boxes.append([middle.translation, shape.half, *middle.rotation.T])
-            edges_of[index] = range(len(ends), len(ends) + len(edges))
-            joint += [0] * len(edges)
-            ends += list(edges)
-            radius += [0.0] * len(edges)
+            count = len(shape.edges(frames[index].placement))
+            box_of[index] = len(box_of)
+            edges_of[index] = range(len(joint), len(joint) + count)
+            joint += [0] * count
+            radius += [0.0] * count
     start, bodies, share = [0], [], []
     for i, j in pairs:
         length, other_length = shapes[i].half[2], shapes[j].half[2]
@@ -229,11 +237,24 @@ def _tables(
         start.append(len(bodies))
     return Segments(
         joint=np.array(joint, dtype=np.int64),
-        ends=np.array(ends).reshape(-1, 2, 3),
+        ends=ends,
         radius=np.array(radius),
-        boxes=np.array(boxes).reshape(-1, 5, 3),
+        boxes=boxes,
     ), Candidates(
         start=np.array(start, dtype=np.int64),
         bodies=np.array(bodies, dtype=np.int64).reshape(-1, 3),
         share=np.array(share).reshape(-1, 4),
     )
+
+
+def _placed(shapes: Sequence[Shape], frames: Sequence[pin.Frame]) -> tuple[Array, Array]:
+    """Return ends of segments, those of the shapes and then of edges, and boxes, as `Segments`."""
+    places = [frame.placement for frame in frames]
+    ends = [shape.ends(place) for shape, place in zip(shapes, places, strict=True)]
+    boxes: list[list[Array]] = []
+    for shape, place in zip(shapes, places, strict=True):
+        if shape.is_box:
+            middle = place * shape.placement
+            boxes.append([middle.translation, shape.half, *middle.rotation.T])
+            ends += list(shape.edges(place))
+    return np.array(ends).reshape(-1, 2, 3), np.array(boxes).reshape(-1, 5, 3)
