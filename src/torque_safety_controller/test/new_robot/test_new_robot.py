@@ -183,6 +183,15 @@ def test_all_mistakes_are_told_at_once_a_line_each():
     assert kind.startswith("joint 'shoulder' is of type 'hinge'; it must be one of revolute,")
     assert "joint 'wrist' has no effort limit" in limit
     assert mass == "link 'hand' has a mass of -1 kg"
+    bare = urdf(more=FINGER.format("wrist"), mass=0).replace('effort="30"', "")
+    with pytest.raises(NewRobotError) as error:  # a gripper hides nothing of other joints
+        find_chain(bare.replace('"2.0"', '"0"'), ["finger"])
+    gripper, limit, mass = str(error.value).splitlines()
+    assert "'finger' mimics another" in gripper
+    assert limit.startswith("joints 'shoulder', 'wrist' have no effort limit")
+    assert mass.startswith(
+        "joints 'shoulder', 'wrist' move no inertia: links 'upper', 'hand' have"
+    )
 
 
 def test_a_joint_that_slides_at_the_end_is_no_gripper_and_has_its_units():
@@ -282,6 +291,10 @@ def test_a_xacro_file_gets_arguments_and_finds_packages(tmp_path, monkeypatch, c
     assert run(tmp_path, head + include, "hand", name="a.xacro") == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("a.xacro fails: it has no argument 'effort'; give effort:=VALUE")
+    more = '<xacro:arg name="name" default="arm"/><a b="$(arg b)" c="$(arg c)"/><!-- $(arg d) -->'
+    named = head.replace('name="arm"', 'name="$(arg name)"') + more + include
+    assert run(tmp_path, named, "hand", name="a.xacro") == 1
+    assert "no argument 'b', 'c'; give b:=VALUE c:=VALUE\n" in capsys.readouterr().err
     assert run(tmp_path, head + include, "hand", "effort:=31", name="a.xacro") == 0
     assert 'effort="31"' in (tmp_path / "arm.urdf").read_text()
     monkeypatch.delenv("ROS_PACKAGE_PATH")

@@ -18,6 +18,7 @@ from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
 from viability_bounds_pkg.robot.description import build_model, kinematic_order
 from viability_bounds_pkg.robot.mistakes import (
     MOVING,
+    about,
     end_of,
     inertial_mistakes,
     inertial_oddities,
@@ -109,14 +110,18 @@ def find_chain(
         ways = _ways(root, tips, base)
     except NewRobotError as error:
         raise NewRobotError("\n".join(wrong or [str(error)])) from None
-    kinds = [line for way in ways for line in _of_kinds(root, way)]
+    kinds = [list(_of_kinds(root, way)) for way in ways]
+    unfit = dict(pair for each in kinds for pair in each[:1])
     moving = {
-        name: each for way in ways for name, each in way.items() if each.get("type") in MOVING
+        name: each
+        for way in ways
+        for name, each in way.items()
+        if each.get("type") in MOVING and name not in unfit
     }
     limits, lacking = _limits(moving, velocity_max)
-    if len(moving) == 1 and not wrong + kinds:
+    if len(moving) == 1 and not wrong and not unfit:
         wrong.append(f"only joint '{next(iter(moving))}' moves; the controller is for two or more")
-    wrong += kinds[:1] or lacking + inertial_mistakes(root, moving)
+    wrong += [*unfit.values(), *lacking, *inertial_mistakes(root, moving)]
     if wrong:
         raise NewRobotError("\n".join(wrong))
     order = kinematic_order(urdf, tuple(moving))
@@ -186,8 +191,8 @@ def _way(above: Mapping[str, Element], tip: str, base: str) -> dict[str, Element
     return {each.get("name", ""): each for each in reversed(way)}
 
 
-def _of_kinds(root: Element, way: Mapping[str, Element]) -> Iterator[str]:
-    """Yield what is wrong with joints without a motor of their own, and grippers, tip first."""
+def _of_kinds(root: Element, way: Mapping[str, Element]) -> Iterator[tuple[str, str]]:
+    """Yield joints without a motor of their own, and of grippers, and why not, tip first."""
     joints = root.findall("joint")
     followers = {
         mimic.get("joint", ""): joint.get("name", "")
@@ -203,10 +208,11 @@ def _of_kinds(root: Element, way: Mapping[str, Element]) -> Iterator[str]:
             if each.get("type") == "prismatic" and end_of(each, "parent") == parent
         ]
         if kind in ("floating", "planar"):
-            yield (
+            line = (
                 f"joint '{name}' is {kind}, which no motor moves; --base {end_of(joint, 'child')} "
                 "leaves it out"
             )
+            yield name, line
             continue
         if joint.find("mimic") is not None and kind in MOVING:
             why = "mimics another"
@@ -216,9 +222,10 @@ def _of_kinds(root: Element, way: Mapping[str, Element]) -> Iterator[str]:
             why = f"is one of the fingers {' and '.join(fingers)}"
         else:
             continue
-        yield (
+        line = (
             f"joint '{name}' {why}, as in a gripper; end the arm before it, with the tip {parent}"
         )
+        yield name, line
 
 
 def _limits(
@@ -226,6 +233,7 @@ def _limits(
 ) -> tuple[dict[str, list[float]], list[str]]:
     """Return position limits, speed and effort of joints by name, and what is wrong with them."""
     limits, wrong = {}, []
+    lacking: dict[str, list[str]] = {}
     for name, joint in moving.items():
         limit = joint.find("limit")
         given = {} if limit is None else limit.attrib
@@ -245,18 +253,21 @@ def _limits(
         for key, what, value in (("effort", "torque", effort), ("velocity", "speed", velocity)):
             if not (math.isfinite(value) and value > 0.0):
                 found = "no" if math.isnan(value) else f"{value:g} as"
-                wrong.append(
-                    f"joint '{name}' has {found} {key} limit: nothing is known of its {what}; "
-                    f'write {key}="..." into its <limit> in the URDF, from the data sheet'
+                why = (
+                    f"{found} {key} limit: nothing is known of the {what}; "
+                    f'write {key}="..." into <limit> in the URDF, from the data sheet'
                 )
+                lacking.setdefault(why, []).append(name)
         if joint.get("type") == "continuous":
             low, high = -math.inf, math.inf
         if not low < high:
-            wrong.append(
-                f"joint '{name}' has no room between its position limits, {low:g} and {high:g}; "
-                'write lower="..." and upper="..." into its <limit>, or make it continuous'
+            why = (
+                f"no room between position limits, {low:g} and {high:g}; "
+                'write lower="..." and upper="..." into <limit>, or make it continuous'
             )
+            lacking.setdefault(why, []).append(name)
         limits[name] = [low, high, velocity, effort]
+    wrong += [f"{about('joint', each, 'has', 'have')} {why}" for why, each in lacking.items()]
     return limits, wrong
 
 

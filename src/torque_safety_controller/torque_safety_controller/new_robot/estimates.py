@@ -187,12 +187,12 @@ def _in_most_states(
     """Return limits of the joints without any in all states, and why they are needed."""
     usual = limits_in_share(chain.model, space, SHARE)
     names = [name for name, each in zip(chain.joints, filtered, strict=True) if each]
-    overrides = {}
+    overrides, weak = {}, []
     for name in names:
         j = chain.joints.index(name)
         unit, force = chain.units(j)
         if usual[j] < 0.5 * LEAST:
-            raise NewRobotError(
+            weak.append(
                 f"joint '{name}': its effort limit of {chain.tau_max[j]:g} {force} does not "
                 f"leave {0.5 * LEAST:g} {unit}/s^2 even in {SHARE:.0%} of its states; is "
                 "that what the motor can do? Correct the URDF, narrow its position limits there, "
@@ -200,6 +200,8 @@ def _in_most_states(
             )
         value = float(min(usual[j], CAP))
         overrides[name] = (-value, value)
+    if weak:
+        raise NewRobotError("\n".join(weak))
     why = (
         f"{', '.join(names)}: torque leaves no acceleration limits in all states, so they are "
         f"those of {SHARE:.0%} of random states, and safety_filter holds the arm as a whole."

@@ -69,6 +69,10 @@ ERRORS = (
 )
 """From the largest to the least that are tried: the first that leave the arm enough count."""
 
+QUICKEST = 10.0
+"""Acceleration limit for each rad/s of the speed limit, 1/s: top speed in 0.1 s. More would only
+make margins larger, as of a slow lift."""
+
 ROOM = 0.5
 """Share of the acceleration limits that the errors of the torques may take."""
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,12 +17,16 @@ from viability_bounds_pkg.robot.description import load_geometry
 from viability_bounds_pkg.robot.files import (
     RobotDescriptionError,
     package_folder,
-    with_own_package,
+    with_near_packages,
 )
 
 
 def through_xacro(path: Path, mappings: Mapping[str, str]) -> str:
-    """Return the URDF that a xacro file and its arguments make."""
+    """Return the URDF that a xacro file and its arguments make.
+
+    Raises:
+        NewRobotError: it fails; names all arguments that it lacks.
+    """
     try:
         import xacro
         from xacro import substitution_args
@@ -35,8 +41,12 @@ def through_xacro(path: Path, mappings: Mapping[str, str]) -> str:
         return str(package_folder(package, path))
 
     substitution_args._eval_find = find
+    text = without_comments(path.read_text(encoding="utf-8", errors="replace"))
+    defaults = _defaults(text)
     try:
-        urdf: str = xacro.process_file(str(path), mappings=dict(mappings)).toprettyxml(indent="  ")
+        # The name of the robot may be an argument, which xacro reads before its default.
+        given = {name: each for name, each in defaults.items() if "$" not in each} | dict(mappings)
+        urdf: str = xacro.process_file(str(path), mappings=given).toprettyxml(indent="  ")
     except Exception as error:  # of many kinds: of its own, of XML, of Python in the file
         cause: Any = error
         while isinstance(inner := getattr(cause, "exc", None), Exception):
@@ -44,11 +54,30 @@ def through_xacro(path: Path, mappings: Mapping[str, str]) -> str:
         why = " ".join(str(cause).split())
         remedy = "give it what it asks for"
         if isinstance(cause, substitution_args.ArgException):
-            why, remedy = f"it has no argument '{cause}'", f"give {cause}:=VALUE"
+            asked = [str(cause), *re.findall(r"\$\(arg (\w+)\)", text)]
+            lacking = dict.fromkeys(name for name in asked if name not in {*defaults, *mappings})
+            why = f"it has no argument {', '.join(map(repr, lacking))}"
+            remedy = f"give {' '.join(f'{name}:=VALUE' for name in lacking)}"
         elif isinstance(cause, RobotDescriptionError):
             remedy = "set ROS_PACKAGE_PATH to the folder with it"
+        elif defaults:
+            remedy = f"its arguments are {', '.join(defaults)}"
         raise NewRobotError(f"xacro {path} fails: {why}; {remedy}") from error
-    return with_own_package(urdf, path)
+    return with_near_packages(urdf, path)
+
+
+def without_comments(text: str) -> str:
+    """Return XML without its comments, in which calls of xacro may be left."""
+    return re.sub("<!--.*?-->", "", text, flags=re.DOTALL)
+
+
+def _defaults(text: str) -> dict[str, str]:
+    """Return the arguments of a xacro file that have defaults; none if it is not well-formed."""
+    with contextlib.suppress(ElementTree.ParseError):
+        root = ElementTree.fromstring(text)
+        arguments = [each.attrib for each in root.iter() if str(each.tag).endswith("}arg")]
+        return {each["name"]: each["default"] for each in arguments if len(each) == 2}
+    return {}
 
 
 def with_tool(urdf: str, tip: str, mass: float, centre: str) -> str:

@@ -26,6 +26,7 @@ from torque_safety_controller.new_robot.estimates import Estimates, estimate
 from torque_safety_controller.new_robot.files import parameter_file, scenario_file
 from torque_safety_controller.new_robot.hardware import (
     ERRORS,
+    QUICKEST,
     ROOM,
     Array,
     Errors,
@@ -34,7 +35,12 @@ from torque_safety_controller.new_robot.hardware import (
     with_rotors,
 )
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
-from torque_safety_controller.new_robot.urdf import shapes, through_xacro, with_tool
+from torque_safety_controller.new_robot.urdf import (
+    shapes,
+    through_xacro,
+    with_tool,
+    without_comments,
+)
 from torque_safety_controller.tools.fit_capsules import with_capsules
 from torque_safety_controller.tools.suitable_gains import (
     GAINS,
@@ -113,9 +119,7 @@ def _read(options: argparse.Namespace) -> tuple[str, str, Path | None]:
     else:
         path = resolve_uri(options.urdf).resolve()
         urdf, folder = urdf_text(path, str(path)), path.parent
-        # What xacro has made may have calls of it left in comments.
-        bare = re.sub("<!--.*?-->", "", urdf, flags=re.DOTALL)
-        if path.suffix == ".xacro" or "<xacro:" in bare:
+        if path.suffix == ".xacro" or "<xacro:" in without_comments(urdf):
             urdf, source = through_xacro(path, options.mappings), ""
         else:
             source = options.urdf if "://" in options.urdf else str(path)
@@ -233,6 +237,12 @@ def _imperfect(
     """
     real = with_rotors(chain, exact.v_max)
     estimates = estimate(real, exact.rate_hz)
+    quickest = QUICKEST * estimates.v_max
+    estimates = replace(
+        estimates,
+        a_min=np.maximum(estimates.a_min, -quickest),
+        a_max=np.minimum(estimates.a_max, quickest),
+    )
     reason = "they take too much of the acceleration limits"
     for errors in ERRORS:
         disturbance = acceleration_errors(real, estimates, errors)

@@ -116,5 +116,9 @@ def test_meshes_of_the_package_around_a_urdf_are_found(tmp_path, monkeypatch):
     path.write_text(f"{ROBOT}<!-- package://described/meshes/a.stl package://other/b.stl -->")
     monkeypatch.delenv("ROS_PACKAGE_PATH", raising=False)
     assert f"<!-- file://{folder}/meshes/a.stl package://other/b.stl -->" in read_urdf(str(path))
+    (tmp_path / "other").mkdir()  # beside the package
+    assert f"file://{tmp_path}/other/b.stl" in read_urdf(str(path))
+    (folder / "package.xml").unlink()  # its name tells enough
+    assert f"file://{folder}/meshes/a.stl" in read_urdf(str(path))
     monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path))  # as if it was installed
     assert "package://described/meshes/a.stl" in read_urdf(str(path))

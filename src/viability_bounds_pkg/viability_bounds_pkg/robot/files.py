@@ -68,44 +68,48 @@ def resolve_uri(uri: str) -> Path:
 
 
 def package_folder(name: str, beside: Path) -> Path:
-    """Return the folder of a package: that of a file, or one where packages are looked up.
+    """Return the folder of a package: where packages are looked up, or around or beside a file.
 
     Raises:
         RobotDescriptionError: there is none.
     """
-    if (own := _own_package(beside)) is not None and own[0] == name:
-        return own[1]
     for directory in package_directories():
         if (directory / name).is_dir():
             return directory / name
+    for folder in beside.resolve().parents:
+        if name in (folder.name, _declared_name(folder)):
+            return folder
+        if (folder / name).is_dir():
+            return folder / name
     raise RobotDescriptionError(
         f"no package '{name}' in the folders of ROS_PACKAGE_PATH, nor in AMENT_PREFIX_PATH"
     )
 
 
-def _own_package(path: Path) -> tuple[str, Path] | None:
-    """Return name and folder of the package that a file lies in; None if it lies in none."""
-    for folder in path.resolve().parents:
-        if (manifest := folder / "package.xml").is_file():
-            try:
-                name = ElementTree.parse(manifest).findtext("name", folder.name)
-            except ElementTree.ParseError:
-                name = folder.name
-            return name.strip(), folder
-    return None
+def _declared_name(folder: Path) -> str:
+    """Return the name of the package that a folder is by its manifest; empty if it is none."""
+    manifest = folder / "package.xml"
+    try:
+        return ElementTree.parse(manifest).findtext("name", "") if manifest.is_file() else ""
+    except ElementTree.ParseError:
+        return ""
 
 
-def with_own_package(text: str, path: Path) -> str:
-    """Return a URDF with ``package://`` URIs of the package that its file lies in as files.
+def with_near_packages(text: str, path: Path) -> str:
+    """Return a URDF with ``package://`` URIs of packages around or beside its file as files.
 
     A package that is installed keeps them.
     """
-    if (own := _own_package(path)) is None:
-        return text
-    name, folder = own
-    if any((directory / name).is_dir() for directory in package_directories()):
-        return text
-    return re.sub(rf"package:///*{re.escape(name)}/", lambda _: f"file://{folder}/", text)
+
+    def place(uri: re.Match[str]) -> str:
+        if any((directory / uri[1]).is_dir() for directory in package_directories()):
+            return uri[0]
+        try:
+            return f"file://{package_folder(uri[1], path)}/"
+        except RobotDescriptionError:
+            return uri[0]
+
+    return re.sub(r"package:///*([\w.-]+)/", place, text)
 
 
 def _other_file(*paths: Path) -> str:
@@ -130,7 +134,7 @@ def read_urdf(uri: str) -> str:
 def urdf_text(path: Path, source: str) -> str:
     """Return the text of a URDF file, in UTF-8 or in the encoding that its first line names.
 
-    Names of meshes in its own package are those of files.
+    Names of meshes in packages around or beside it are those of files.
 
     Raises:
         RobotDescriptionError: it cannot be read; names `source`.
@@ -143,7 +147,7 @@ def urdf_text(path: Path, source: str) -> str:
     encoding = declared[1].decode() if declared else "utf-8"
     for each in ("utf-8", encoding):
         try:
-            return with_own_package(data.decode(each), path)
+            return with_near_packages(data.decode(each), path)
         except (LookupError, UnicodeDecodeError):
             continue
     raise RobotDescriptionError(

@@ -71,6 +71,7 @@ def inertial_mistakes(
     links = {each.get("name", ""): each for each in root.findall("link")}
     moving = set(joints)
     found: dict[str, None] = {}  # each once, in order
+    idle: dict[str, str] = {}
     for joint in root.findall("joint"):
         name = joint.get("name", "")
         if name not in moving:
@@ -82,12 +83,21 @@ def inertial_mistakes(
         found |= dict.fromkeys(wrong)
         massless = all(_mass(link) == 0.0 for link in body)
         if massless and not wrong and not (rotors or {}).get(name):
-            found[
-                f"joint '{name}' moves no inertia: link '{end_of(joint, 'child')}' has no "
-                "<inertial> with a mass; write mass and moments of inertia into the URDF, or end "
-                "the arm before it"
-            ] = None
+            idle[name] = end_of(joint, "child")
+    if idle:
+        found[
+            f"{about('joint', idle, 'moves', 'move')} no inertia: "
+            f"{about('link', idle.values(), 'has', 'have')} no "
+            "<inertial> with a mass; write mass and moments of inertia into the URDF, or leave "
+            "such joints out by the tip or by --base"
+        ] = None
     return list(found)
+
+
+def about(kind: str, names: Collection[str], one: str, several: str) -> str:
+    """Return the beginning of a line about joints or links, with the verb for one or several."""
+    shown = ", ".join(f"'{name}'" for name in names)
+    return f"{kind} {shown} {one}" if len(names) == 1 else f"{kind}s {shown} {several}"
 
 
 def inertial_oddities(root: Element, joints: Iterable[str]) -> list[str]:
