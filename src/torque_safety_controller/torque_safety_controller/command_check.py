@@ -9,6 +9,7 @@ disturbance: nothing is to be learned from it.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -36,6 +37,7 @@ class CommandCheck:
     def __init__(self, tolerance: Array, reach: int) -> None:
         self._tolerance = tolerance
         self._sent = np.zeros((reach, tolerance.size))
+        _within(tolerance, self._sent, tolerance)  # compiled before states come
         self.times = 0
         self.reset()
 
@@ -63,9 +65,7 @@ class CommandCheck:
         """
         if self._count == 0:
             return True
-        low, high = np.minimum.reduce(self._sent), np.maximum.reduce(self._sent)
-        beyond = np.maximum(low - effort, effort - high) - self._tolerance
-        if beyond.max() <= 0.0:  # not so where it is NaN
+        if _within(effort, self._sent, self._tolerance):
             self._agreed += 1
             self._in_row = 0
             return True
@@ -75,3 +75,13 @@ class CommandCheck:
         self._in_row += 1
         self.times += self._in_row == IGNORED_AFTER
         return False
+
+
+@njit(cache=True)
+def _within(effort: Array, sent: Array, tolerance: Array) -> bool:
+    """Return whether torques, shape (n,), are in the range of others, shape (k, n)."""
+    for j in range(effort.size):
+        low, high = sent[:, j].min() - tolerance[j], sent[:, j].max() + tolerance[j]
+        if not low <= effort[j] <= high:
+            return False
+    return True

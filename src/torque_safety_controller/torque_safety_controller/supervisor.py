@@ -167,7 +167,7 @@ class Supervisor:
             self.change("failed", f"handover failed: {CAUSES['stale'].reason}")
         if self.by_drives:
             return REST
-        at_rest = bool(np.abs(v).max() <= REST_SPEED)
+        at_rest = max(map(abs, v.tolist())) <= REST_SPEED
         passed = elapsed or 0.0
         if self.control is Control.GIVING_BACK:
             self._giving_back_for += passed

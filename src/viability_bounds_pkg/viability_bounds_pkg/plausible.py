@@ -100,16 +100,22 @@ class PlausibilityCheck:
     ) -> None:
         speed = np.where(np.isfinite(velocity_max), velocity_max, NO_SPEED_LIMIT)
         width = position_max - position_min
-        self._low = np.maximum(position_min - width, -FARTHEST)
-        self._high = np.minimum(position_max + width, FARTHEST)
-        self._speed, self._fastest, self._impossible = speed, FAST * speed, IMPOSSIBLE * speed
+        self._speed = speed
         self._dt, self._gap = dt, max(GAP, 3.0 * dt)
         self._zero = np.zeros_like(speed)
-        self._uses_velocities = velocity_error is not None
         self._position = POSITION_ERROR + 2.0 * position_error
         error = VELOCITY_ERROR * speed + (0.0 if velocity_error is None else velocity_error)
-        # An impact, at any moment of a period, changes a speed from one limit to the other.
-        self._drift = self._position + WINDOW * error + 2.0 * dt * speed
+        self._limits = np.array(
+            [
+                np.maximum(position_min - width, -FARTHEST),
+                np.minimum(position_max + width, FARTHEST),
+                np.full_like(speed, np.nan) if velocity_error is None else IMPOSSIBLE * speed,
+                FAST * speed,
+                self._position,
+                # An impact changes a speed from one limit to the other, any time in a period.
+                self._position + WINDOW * error + 2.0 * dt * speed,
+            ]
+        )
         nothing = _Past(State(self._zero, self._zero), 0.0, self._zero)
         self._compare(nothing, nothing.state, dt, 0.0)  # compiled before states come
         self.reset()
@@ -134,14 +140,13 @@ class PlausibilityCheck:
         elif time <= self._newest:
             return NOT_LATER
         self._newest = time
-        if reason := self._out_of_range(state):
+        before = self._accepted or _Past(state, time, self._zero)
+        unseen = 0.0 if self._doubted else time - before.time - self._dt
+        reason, after = self._compare(before, state, time, unseen)
+        if reason in (OUTSIDE, TOO_FAST):
             self._reason = reason
             return reason
-        if self._accepted is None:
-            return self._accept(_Past(state, time, self._zero))
-        unseen = 0.0 if self._doubted else time - self._accepted.time - self._dt
-        reason, after = self._compare(self._accepted, state, time, unseen)
-        if not reason and time - self._accepted.time <= self._gap:
+        if not reason and time - before.time <= self._gap:
             return self._accept(after)
         self._reason = reason or self._reason
         if self._doubted is None:
@@ -151,7 +156,7 @@ class PlausibilityCheck:
             reason, after = self._compare(self._doubted, state, time, unseen)
             if reason:
                 self._since = time
-            elif time - self._since >= WINDOW and self._within_reach(self._accepted.state, state):
+            elif time - self._since >= WINDOW and self._within_reach(before.state, state):
                 return self._accept(after)
         self._doubted = after
         return self._reason
@@ -165,13 +170,6 @@ class PlausibilityCheck:
         moved = np.abs(state.q - before.q)
         return bool((moved <= self._position + STOPPING * self._speed).all())
 
-    def _out_of_range(self, state: State) -> str:
-        if not ((self._low <= state.q) & (state.q <= self._high)).all():
-            return OUTSIDE
-        if self._uses_velocities and (np.abs(state.v) > self._impossible).any():
-            return TOO_FAST
-        return ""
-
     def _compare(self, past: _Past, state: State, time: float, unseen: float) -> tuple[str, _Past]:
         """Return why a state cannot come after another, and what is known after it.
 
@@ -183,35 +181,41 @@ class PlausibilityCheck:
         """
         found, drift = _compared(
             past.state.q, past.state.v, past.drift, state.q, state.v, time - past.time,
-            max(unseen, 0.0), self._position, self._fastest, self._drift, self._uses_velocities,
+            max(unseen, 0.0), self._limits,
         )  # fmt: skip
         return _REASONS[found], _Past(state, time, drift)
 
 
-_REASONS = ("", CONTRADICTION, JUMP)
+_REASONS = ("", CONTRADICTION, JUMP, TOO_FAST, OUTSIDE)
 
 
 @njit(cache=True)
 def _compared(
     q0: Array, v0: Array, drift0: Array, q: Array, v: Array, h: float, unseen: float,
-    position: Array, fastest: Array, most: Array, uses_velocities: bool,
+    limits: Array,
 ) -> tuple[int, Array]:  # fmt: skip
     """Return the index in `_REASONS` of what is wrong with a state, and the drift after it.
 
     `q0`, `v0` and `drift0` are of the earlier state, `h` is the time between both, `unseen` that
-    of which nothing is known. `position`, `fastest` and `most` bound errors of positions,
-    speeds of joints that are pushed, and the drift. Arrays are of shape (n,), units as above.
+    of which nothing is known. Rows of `limits` bound positions from below and above, speeds (NaN
+    where velocities are not used), those of joints that are pushed, errors of positions, and the
+    drift. Arrays are of shape (n,), units as above.
     """
     found, drift = 0, np.zeros_like(q)
     for j in range(q.size):
-        moved, speed = q[j] - q0[j], fastest[j]
-        if uses_velocities:
+        low, high, impossible, fastest, error, most = limits[:, j]
+        moved, speed = q[j] - q0[j], fastest
+        if not low <= q[j] <= high:
+            found = 4
+        if impossible > 0.0:
+            if abs(v[j]) > impossible:
+                found = max(found, 3)
             speed = max(speed, abs(v[j]))
             drift[j] = math.exp(-h / WINDOW) * drift0[j] + moved - 0.5 * h * (v0[j] + v[j])
-        if abs(moved) > position[j] + h * speed:
-            found = 2
-        elif abs(drift[j]) > most[j] + unseen * fastest[j]:
+        if abs(moved) > error + h * speed:
+            found = max(found, 2)
+        elif abs(drift[j]) > most + unseen * fastest:
             found = max(found, 1)
         if unseen > 0.0:
-            drift[j] = min(max(drift[j], -most[j]), most[j])
+            drift[j] = min(max(drift[j], -most), most)
     return found, drift if found == 0 else np.zeros_like(q)

@@ -10,6 +10,8 @@ Without contacts it is eq. (33) of [DelPrete2018]. Torques are eliminated by the
 
 from __future__ import annotations
 
+import math
+import operator
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -62,9 +64,10 @@ class AccelerationRange(NamedTuple):
     @property
     def fault(self) -> str:
         """What is wrong with bounds that are to be finite, in words; empty for nothing."""
-        if not (np.isfinite(self.lower).all() and np.isfinite(self.upper).all()):
+        lower, upper = self.lower.tolist(), self.upper.tolist()  # faster than arrays of few
+        if not all(map(math.isfinite, lower + upper)):
             return "not finite"
-        return "lower above upper" if (self.lower > self.upper).any() else ""
+        return "lower above upper" if any(map(operator.gt, lower, upper)) else ""
 
 
 class LinearConstraints(NamedTuple):

@@ -224,7 +224,7 @@ class JointStateReader:
             return None
         self._order.find(message.name)
         tau = np.array(message.effort)[self._order.index]
-        return tau if np.isfinite(tau).all() else None
+        return tau if all(map(math.isfinite, tau.tolist())) else None
 
     def with_state(self, state: State) -> JointState:
         """Return the last accepted message with another state of the joints, all else as it is.
