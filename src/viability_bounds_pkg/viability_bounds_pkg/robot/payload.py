@@ -112,7 +112,7 @@ class Payload:
         if (far := np.linalg.norm(lever)) > FARTHEST:
             allowed = f"up to {FARTHEST:g} m"
             raise PayloadError("centre of mass", f"is {far:g} m from the link; allowed: {allowed}")
-        moments: Array = np.linalg.eigvalsh(tensor)
+        moments = np.asarray(np.linalg.eigvalsh(tensor), dtype=np.float64)
         slack = moments_slack(moments)
         impossible = moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack
         if impossible or moments[2] > mass * FARTHEST**2 + slack:
