@@ -201,6 +201,29 @@ def test_what_cannot_be_used_is_named(tmp_path, changed, message):
         loaded(tmp_path, contents)
 
 
+def test_samples_that_lack_numbers_are_left_out(tmp_path):
+    contents = arrays()
+    contents["q"][50:60] = contents["v"][50:60] = contents["tau"][50:61] = math.nan
+    found = loaded(tmp_path, contents)
+    assert (len(found.t), found.lost) == (189, 11)
+    np.testing.assert_array_equal(found.t, np.delete(contents["t"], slice(50, 61)))
+
+
+def test_files_that_are_cut_off_damaged_or_of_another_kind_are_refused(tmp_path):
+    path = tmp_path / "run.npz"
+    rng = np.random.default_rng(0)
+    np.savez_compressed(path, **arrays())
+    whole = path.read_bytes()
+    damaged = []
+    for start in range(100, len(whole) // 2, 100):
+        damaged.append(whole[:start] + rng.bytes(40) + whole[start + 40 :])
+    for content in (b"", b"a,b\n1,2\n", whole[:-30], *damaged):
+        path.write_bytes(content)
+        with pytest.raises(RecordingError, match="no .npz file, or one|no NumPy file") as refused:
+            load_recording(path, JOINTS)
+        assert "unsafely" not in str(refused.value)
+
+
 def test_angles_in_degrees_are_refused(recording, call, tmp_path):
     columns = {key: np.degrees(getattr(recording, key)) for key in ("q", "v")}
     run = save(tmp_path / "run.npz", Recording(recording.t, **columns, tau=recording.tau))

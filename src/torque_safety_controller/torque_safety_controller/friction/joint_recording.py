@@ -8,10 +8,11 @@ then, as in ``joint_states``, so that the mean torque is that of samples s + 1 t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
+from zipfile import BadZipFile, is_zipfile
+from zlib import error as CompressionError
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,7 @@ class Recording:
         q: position, shape (N, n), rad.
         v: velocity, shape (N, n), rad/s.
         tau: torque of the motors, shape (N, n), N m.
+        lost: number of further samples of which something is not known.
 
     Raises:
         RecordingError: shapes do not fit, a number is not finite, or time does not increase.
@@ -49,6 +51,7 @@ class Recording:
     q: Array
     v: Array
     tau: Array
+    lost: int = 0
 
     def __post_init__(self) -> None:
         samples, n = len(self.t), self.n
@@ -73,6 +76,8 @@ class Recording:
 def load_recording(path: Path, joints: Sequence[str]) -> Recording:
     """Return a recording from a NumPy file of `t`, `q`, `v`, `tau` and perhaps `joints`.
 
+    Samples with NaN, as of messages that were lost, are left out: they make a gap.
+
     Args:
         path: ``.npz``; the columns are in the order of its `joints`, or else of `joints`.
         joints: names of the joints wanted, in the order wanted; the file may have more.
@@ -82,6 +87,8 @@ def load_recording(path: Path, joints: Sequence[str]) -> Recording:
             or velocities are not those of the positions: of other units, or other joints.
     """
     try:
+        if path.is_file() and not is_zipfile(path):
+            raise RecordingError("no .npz file, or one whose end is missing")
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: file[key].astype(np.float64) for key in KEYS}
             names = [str(name) for name in file["joints"]] if "joints" in file else list(joints)
@@ -95,15 +102,32 @@ def load_recording(path: Path, joints: Sequence[str]) -> Recording:
                     f"{arrays[key].shape}"
                 )
             arrays[key] = arrays[key][:, [names.index(joint) for joint in joints]]
-        recording = Recording(**arrays)
+        lost = _lost(arrays)
+        recording = Recording(
+            **{key: value[~lost] if lost.any() else value for key, value in arrays.items()},
+            lost=int(lost.sum()),
+        )
         _check_rates(recording, joints)
         return recording
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
     except KeyError as error:
         raise RecordingError(f"{path}: array missing: {error}") from error
-    except (OSError, TypeError, ValueError, EOFError, BadZipFile) as error:
+    except (OSError, TypeError, ValueError, EOFError, BadZipFile, CompressionError) as error:
         raise RecordingError(f"{path}: no NumPy file of arrays of numbers ({error})") from error
+
+
+def _lost(arrays: Mapping[str, Array]) -> NDArray[np.bool_]:
+    """Return which samples have NaN, shape (N,); none of them if that leaves nothing, or unequal.
+
+    `Recording` says what is wrong then.
+    """
+    none = np.zeros(len(arrays["t"]), dtype=bool)
+    if len({len(value) for value in arrays.values()}) > 1:
+        return none
+    unknown = [np.isnan(arrays[key]).any(axis=1) for key in KEYS[1:]]
+    lost: NDArray[np.bool_] = np.logical_or.reduce(unknown)
+    return none if lost.all() else lost
 
 
 def _check_rates(recording: Recording, joints: Sequence[str]) -> None:

@@ -68,6 +68,9 @@ def _run(options: argparse.Namespace) -> int:
     names = list(model.names)[1:]
     recording = load_recording(options.recording, names)
     _check_positions(options.recording, names, recording.q, robot)
+    if recording.lost:
+        samples = len(recording.t) + recording.lost
+        print(f"{recording.lost} of {samples} samples lack numbers, and are left out")
     # With no terminal to draw on there is no bar.
     bar = tqdm(identify(model, recording), total=len(names), unit=" joints", disable=None)
     try:
