@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -26,6 +27,9 @@ _REFUSED = (RobotDescriptionError, ObstacleError, ValueError)
 
 AHEAD_MAX = 3600.0
 """Messages with stamps further ahead are of another clock, s: scenarios are sent whole."""
+
+SAME_PERIOD = 1.0
+"""Refusals in a row that differ in numbers only get a line this often, s."""
 
 WAITING_MAX = 10_000
 """So many messages may wait for their time."""
@@ -72,6 +76,7 @@ class WorldSubscriber:
         self._robot, self._now, self._refused = robot, now, refused
         self._wrench_timeout = round(1e9 * wrench_timeout)
         self._pending: list[_Change] = []
+        self._told, self._told_at = "", -math.inf
         self.wrench_ends: dict[str, int] = {}
         for topic, callback in (
             (EXTERNAL_WRENCH, self._on_wrench),
@@ -171,8 +176,13 @@ class WorldSubscriber:
             raise ObstacleError(f"there is no obstacle {name!r}")
 
     def _refuse(self, topic: str, reason: Exception | str) -> None:
+        """Count a refusal; of those in a row that differ in numbers only, one a second is told."""
         self._refused[topic] += 1
-        self._logger.warning(f"{topic} refused: {reason}")
+        text, now = f"{topic} refused: {reason}", time.monotonic()
+        kind = "".join(each for each in text if not each.isdigit())
+        if kind != self._told or now - self._told_at > SAME_PERIOD:
+            self._told, self._told_at = kind, now
+            self._logger.warning(text)
 
 
 def _placed(obstacle: Obstacle, frame: pin.SE3) -> Obstacle:

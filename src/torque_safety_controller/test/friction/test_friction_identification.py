@@ -224,6 +224,13 @@ def test_files_that_are_cut_off_damaged_or_of_another_kind_are_refused(tmp_path)
         assert "unsafely" not in str(refused.value)
 
 
+def test_angles_that_a_driver_wraps_are_taken(tmp_path):
+    turned = np.arctan2(np.sin(TURNING + 3.0), np.cos(TURNING + 3.0))
+    contents = {"t": T, "q": turned, "v": SPEED, "tau": TURNING}
+    assert np.ptp(turned[:, 0]) > 6.0
+    assert loaded(tmp_path, contents).n == 2
+
+
 def test_angles_in_degrees_are_refused(recording, call, tmp_path):
     columns = {key: np.degrees(getattr(recording, key)) for key in ("q", "v")}
     run = save(tmp_path / "run.npz", Recording(recording.t, **columns, tau=recording.tau))

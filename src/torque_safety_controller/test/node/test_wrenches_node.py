@@ -231,6 +231,7 @@ def contact(**changed):
         ({"yield_threshold": [0.0, 1.0]}, "yield_threshold"),
         ({"contacts": [contact(), contact(frame="panda_link8")]}, "contacts"),
         ({"contacts": [contact(point=[0.0, 1.0])]}, "contacts[0].point"),
+        ({"contacts": [contact(point=[0.0, 0.0, 100.0])]}, "contacts[0].point"),
         ({"contacts": [contact(normal=[0.0, 0.0, 0.0])]}, "contacts[0].normal"),
         ({"contacts": [contact(friction=-0.5)]}, "contacts[0].friction"),
         ({"contacts": [contact(), contact(friction=0.1)]}, "contacts[1].friction"),

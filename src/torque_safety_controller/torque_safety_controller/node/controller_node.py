@@ -311,7 +311,8 @@ class ControllerNode(ArmNode):
 
     def _watch(self) -> None:
         now, config, states = time.monotonic(), self._config, self._states
-        nothing = self.publisher_watch.trouble or "no joint state"
+        source = " from estimator_node" if self.uses_estimates else ""
+        nothing = self.publisher_watch.trouble or f"no joint state{source}"
         if now - states.message_at > QUIET * config.bounds_timeout:
             self._supervisor.silent(nothing)
         elif states.silent(now):

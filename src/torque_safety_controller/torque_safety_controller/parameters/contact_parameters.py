@@ -72,13 +72,15 @@ def _read(kind: type[Entry], label: str, text: str) -> Entry:
 
 Array = NDArray[np.float64]
 
+_OF_LINK = Range(-10.0, 10.0)  # m; more are millimetres
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactPoint:
     """One entry of ``contacts``."""
 
     frame: str = text("name of the link")
-    point: Array = numbers("in its axes, m", FINITE, length=3, default=(0.0, 0.0, 0.0))
+    point: Array = numbers("in its axes, m", _OF_LINK, length=3, default=(0.0, 0.0, 0.0))
     normal: Array = numbers("direction in which the environment pushes", FINITE, length=3)
     friction: float = number("Coulomb's coefficient", NOT_NEGATIVE, default=0.0)
 
@@ -124,7 +126,6 @@ def _contact_points(entries: tuple[str, ...]) -> tuple[ContactPoint, ...]:
     return points
 
 
-_OF_LINK = Range(-10.0, 10.0)  # m; more are millimetres
 _EQUAL = {"cylinder": 2, "sphere": 3}  # of the numbers of a size, how many are one diameter
 
 
