@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One controller step: its parts, by each solver, and beside Pinocchio's terms or TSID's step.
+"""One controller step: by each solver, beside Pinocchio's terms; or by stages, beside TSID's step.
 
 Panda follows poses and postures at random within its limits of position, speed, acceleration and
 torque, so that limits are active. The same states are answered once more, by turns; times are of
-the processor, medians of the blocks. With ``--tsid`` TSID gets the same tasks, weights, limits and
-states; values are compared first. It has an environment of its own, made when missing.
+the processor, medians of the blocks. With ``--stages`` TSID gets the same tasks, weights, limits
+and states, once for poses and once for postures only; values are compared first. Each stage is
+timed without those inside of it, in a turn of its own; what none of them has is Python between.
+Times are then medians over the steps. TSID has an environment of its own, made when missing.
 """
 
 from __future__ import annotations
@@ -12,8 +14,10 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pinocchio as pin
@@ -21,8 +25,11 @@ from live_robot import load
 from other_environment import TSID, Arrays, worker
 from panda import A_MAX, FRAME, JOINTS, TAU_MAX, limits_of, make_controller, problem
 
+from torque_safety_controller.limiter import TorqueLimiter
 from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import SOLVERS, AccelerationRange, InverseDynamicsQP
+from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.pose_task import PoseTask
 from torque_safety_controller.tasks.posture_task import PostureTask
@@ -51,12 +58,11 @@ class TsidGoals(Goals):
         """Return the pose task and the posture task."""
         gains = self.gains
         posture = gains.posture_kp, gains.posture_kd, gains.posture_weight
-        return [
-            PoseTask(
-                self.pose_des, gains.pose_kp, gains.pose_kd, gains.pose_weight, separate=True
-            ),
-            PostureTask(self.q_des, *posture),
-        ]
+        tasks: list[Task] = [PostureTask(self.q_des, *posture)]
+        if self.pose_des is not None:
+            pose = gains.pose_kp, gains.pose_kd, gains.pose_weight
+            tasks.append(PoseTask(self.pose_des, *pose, separate=True))
+        return tasks
 
 
 class Ours:
@@ -66,9 +72,12 @@ class Ours:
         solver: of the QP.
         as_tsid: with TSID's tasks, its weight of the accelerations, and torques of the instant
             rather than of the middle of the step.
+        weight: greatest of the tasks, which that of the accelerations is relative to.
     """
 
-    def __init__(self, solver: str = "daqp", *, as_tsid: bool = False) -> None:
+    def __init__(
+        self, solver: str = "daqp", *, as_tsid: bool = False, weight: float = 1.0
+    ) -> None:
         given = problem(DT)
         self.model = build_model(given["urdf"], JOINTS)
         self.low, self.high = given["low"], given["high"]
@@ -79,11 +88,12 @@ class Ours:
             self.model, goals, 0.0 if as_tsid else DT, middle, solver
         )
         if as_tsid:
-            self.controller._qp = InverseDynamicsQP(self.model.nv, REGULARISATION)
+            self.controller._qp = InverseDynamicsQP(self.model.nv, REGULARISATION / weight)
 
     def set_goal(self, posture: np.ndarray, pose: np.ndarray) -> None:
-        """Set goals: positions, shape (7,), rotation and translation, shape (3, 4)."""
-        self.controller.goals.set_pose(pin.SE3(pose[:, :3], pose[:, 3]))
+        """Set goals: positions, shape (7,), rotation and translation, shape (3, 4), or NaN."""
+        if not np.isnan(pose).any():
+            self.controller.goals.set_pose(pin.SE3(pose[:, :3], pose[:, 3]))
         self.controller.goals.set_posture(posture)
 
     def step(self, q: np.ndarray, v: np.ndarray) -> Any:
@@ -100,10 +110,22 @@ class Ours:
             self.step(q, v)
         return 1e6 * (time.thread_time() - begin) / len(given["q"])
 
+    def typical(self, given: Arrays) -> float:
+        """Answer all states; return microseconds of a step, the median."""
+        times = np.empty(len(given["q"]))
+        for k, (q, v) in enumerate(zip(given["q"], given["v"], strict=True)):
+            if k % STEPS_PER_GOAL == 0:
+                self.set_goal(given["posture"][k], given["pose"][k])
+            begin = time.perf_counter_ns()
+            self.step(q, v)
+            times[k] = time.perf_counter_ns() - begin
+        return 1e-3 * float(np.median(times))
 
-def record(steps: int) -> Arrays:
+
+def record(steps: int, *, poses: bool = True) -> Arrays:
     """Move the arm; return states, goals, bounds, accelerations and torques."""
-    ours, rng = Ours(as_tsid=True), np.random.default_rng(0)
+    weight = 1.0 if poses else GAINS["posture_weight"]
+    ours, rng = Ours(as_tsid=True, weight=weight), np.random.default_rng(0)
     model, data = ours.model, ours.model.createData()
     q, v = 0.5 * (ours.low + ours.high), np.zeros(model.nv)
     names = ("q", "v", "pose", "posture", "bounds", "a", "tau")
@@ -113,7 +135,7 @@ def record(steps: int) -> Arrays:
             posture = rng.uniform(ours.low, ours.high)
             pin.framesForwardKinematics(model, data, posture)
             goal = data.oMf[model.getFrameId(FRAME)]
-            pose = np.c_[goal.rotation, goal.translation]
+            pose = np.c_[goal.rotation, goal.translation] * (1.0 if poses else np.nan)
             ours.set_goal(posture, pose)
         output = ours.step(q, v)
         assert output.relaxation is None and not output.failure
@@ -142,40 +164,68 @@ def model_terms(model: pin.Model, given: Arrays) -> float:
     return 1e6 * (time.thread_time() - begin) / len(given["q"])
 
 
+PINOCCHIO = (
+    *("crba", "nonLinearEffects", "rnea", "forwardKinematics", "computeJointJacobians"),
+    *("updateFramePlacement", "getFrameJacobian", "getFrameAcceleration", "SE3ToXYZQUAT"),
+)
+STAGES: dict[str, list[tuple[Any, str]]] = {
+    "bounds": [(BoundsSolver, "bounds")],
+    "Pinocchio": [(pin, name) for name in PINOCCHIO],
+    "model": [(RobotModel, "update")],
+    "tasks": [(PoseTask, "term"), (PostureTask, "term")],
+    "QP built": [(InverseDynamicsQP, "build")],
+    "QP solved": [(InverseDynamicsQP, "solve")],
+    "torque": [(RobotModel, "torque"), (TorqueLimiter, "limited")],
+    "parts": [(Goals, "prepare"), (JointBounds, "prepare")],
+}
+"""Functions by stage."""
+
+
 class Staged(Ours):
     """A controller whose stages are timed."""
 
     def __init__(self) -> None:
-        super().__init__()
-        self._seconds: dict[str, float] = {}
-        for stage, owner, function in (
-            ("bounds", self.bounds, "bounds"),
-            ("model", self.controller.robot, "update"),
-            ("QP built", self.controller._qp, "build"),
-            ("QP solved", self.controller._qp, "solve"),
-            ("torque", self.controller.robot, "torque"),
-        ):
-            self._watch(stage, owner, function)
+        self._now, self._inside = dict.fromkeys(STAGES, 0), 0
+        with self._watched():  # the controller keeps methods of its parts
+            super().__init__()
 
-    def _watch(self, stage: str, owner: Any, function: str) -> None:
-        """Add the time in a method of an object to a stage."""
-        plain = getattr(owner, function)
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        """Let all functions of all stages be timed for a while."""
+        with ExitStack() as stack:
+            for stage, functions in STAGES.items():
+                for owner, name in functions:
+                    timed = self._timed(stage, getattr(owner, name))
+                    stack.enter_context(patch.object(owner, name, timed))
+            yield
+
+    def _timed(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that adds its time, without that of stages inside, to its stage."""
 
         def timed(*arguments: Any) -> Any:
-            begin = time.thread_time()
-            result = plain(*arguments)
-            self._seconds[stage] += time.thread_time() - begin
-            return result
+            before, self._inside = self._inside, 0
+            begin = time.perf_counter_ns()
+            try:
+                return function(*arguments)
+            finally:
+                whole = time.perf_counter_ns() - begin
+                self._now[stage] += whole - self._inside
+                self._inside = before + whole
 
-        setattr(owner, function, timed)
-        self._seconds[stage] = 0.0
+        return timed
 
     def stages(self, given: Arrays) -> dict[str, float]:
-        """Return microseconds of a step by stage; all else with what the clocks take."""
-        self._seconds = dict.fromkeys(self._seconds, 0.0)
-        whole = self.block(given)
-        found = {name: 1e6 * each / len(given["q"]) for name, each in self._seconds.items()}
-        return found | {"tasks and all else": whole - sum(found.values())}
+        """Answer all states; return microseconds of a step by stage, medians."""
+        times = np.empty((len(given["q"]), len(STAGES)))
+        with self._watched():
+            for k, (q, v) in enumerate(zip(given["q"], given["v"], strict=True)):
+                if k % STEPS_PER_GOAL == 0:
+                    self.set_goal(given["posture"][k], given["pose"][k])
+                self._now = dict.fromkeys(STAGES, 0)
+                self.step(q, v)
+                times[k] = list(self._now.values())
+        medians = 1e-3 * np.median(times, axis=0)
+        return dict(zip(STAGES, medians.tolist(), strict=True))
 
 
 def by_turns(
@@ -204,29 +254,43 @@ def compare_values(given: Arrays, found: Arrays) -> None:
     )
 
 
-def measure(given: Arrays, rounds: int, ask_tsid: Any = None) -> None:
-    """Time by turns, and print."""
+def measure(given: Arrays, rounds: int) -> None:
+    """Time each solver and Pinocchio's terms by turns, and print."""
     arms = {solver: Ours(solver) for solver in SOLVERS}
     model = arms["daqp"].model
     questions: dict[str, Callable[[], dict[str, float]]] = {
         f"step, {solver}": lambda arm=arm: {"whole": arm.block(given)}
         for solver, arm in arms.items()
     }
-    timed = Staged()
-    questions["stages"] = lambda: timed.stages(given)
     questions["Pinocchio's terms"] = lambda: {"whole": model_terms(model, given)}
-    if ask_tsid is not None:
-        parts = ("problem, with bounds", "QP solved", "results")
-        questions["TSID's step"] = lambda: dict(zip(parts, ask_tsid(), strict=True))
     found = by_turns(questions, rounds)
-    sums = {name: sum(each.values()) for name, each in found.items()}
-    for name, stages in found.items():
-        listed = "" if len(stages) == 1 else ", ".join(f"{k} {t:.1f}" for k, t in stages.items())
-        print(f"{name:20}{sum(stages.values()):8.1f} us   {listed}")
-    step = sums["step, daqp"]
-    for name in ("Pinocchio's terms", "TSID's step"):
-        if name in sums:
-            print(f"step / {name}: {step / sums[name]:.2f}")
+    for name, each in found.items():
+        print(f"{name:20}{each['whole']:8.1f} us")
+    ratio = found["step, daqp"]["whole"] / found["Pinocchio's terms"]["whole"]
+    print(f"step / Pinocchio's terms: {ratio:.2f}")
+
+
+def measure_stages(given: Arrays, rounds: int) -> dict[str, float]:
+    """Compare values with TSID's; return microseconds by stage, ours and TSID's, by turns."""
+    asked = given | problem(DT, **GAINS) | {"steps_per_goal": STEPS_PER_GOAL}
+    if not np.isnan(given["pose"]).any():
+        asked["frame"] = FRAME
+    with worker(TSID, asked, "step", "tsid") as (answers, ask):
+        compare_values(given, answers)
+        plain, staged = Ours(), Staged()
+        parts = ("TSID: problem, bounds", "TSID: QP solved", "TSID: results", "TSID")
+        found = by_turns(
+            {
+                "step": lambda: {"step": plain.typical(given)},
+                "stages": lambda: staged.stages(given),
+                "TSID": lambda: dict(zip(parts, ask(), strict=True)),
+            },
+            rounds,
+        )
+    stages, step = found["stages"], found["step"]["step"]
+    between = {"Python between": step - sum(stages.values()), "step": step}
+    ratio = {"step / TSID": step / found["TSID"]["TSID"]}
+    return stages | between | found["TSID"] | ratio
 
 
 def main() -> None:
@@ -234,18 +298,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=2000, help="in a block")
     parser.add_argument("--rounds", type=int, default=15, help="of blocks by turns")
-    parser.add_argument("--tsid", action="store_true", help="beside TSID 1.7.1")
+    parser.add_argument("--stages", action="store_true", help="by stage, beside TSID 1.7.1")
     options = parser.parse_args()
     given = record(options.steps)
     limited = (A_MAX - np.abs(given["a"]) < 1e-6).any(axis=1).mean()
     print(f"{load()}; in {limited:.0%} of the steps a joint is at its acceleration limit")
-    if not options.tsid:
+    if not options.stages:
         measure(given, options.rounds)
         return
-    asked = given | problem(DT, **GAINS) | {"frame": FRAME, "steps_per_goal": STEPS_PER_GOAL}
-    with worker(TSID, asked, "step", "tsid") as (found, ask):
-        compare_values(given, found)
-        measure(given, options.rounds, ask)
+    pose = measure_stages(given, options.rounds)
+    posture = measure_stages(record(options.steps, poses=False), options.rounds)
+    print(f"\n| {'us':22} | pose | posture |\n|---|---|---|")
+    for name, time_ in pose.items():
+        print(f"| {name:22} | {time_:.1f} | {posture[name]:.1f} |")
 
 
 if __name__ == "__main__":

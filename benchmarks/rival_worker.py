@@ -65,7 +65,7 @@ class Tsid:
         """Set the posture to reach; and the pose: rotation and translation, shape (3, 4)."""
         goal = self._tsid.TrajectoryEuclidianConstant("goal", q_des)
         self._posture.setReference(goal.computeNext())
-        if pose is not None:
+        if pose is not None and not np.isnan(pose).any():
             place = self._tsid.TrajectorySE3Constant("goal", pin.SE3(pose[:, :3], pose[:, 3]))
             self._pose.setReference(place.computeNext())
 
@@ -140,8 +140,8 @@ def answer(given: Arrays, _: str, urdf: Path) -> tuple[Arrays, Callable[[], Time
         lower[i], upper[i] = bounds.lowerBound, bounds.upperBound
 
     def timed() -> Times:
-        """Return microseconds of the processor of a step: problem, solution, results."""
-        parts, clock = np.zeros(3), time.thread_time
+        """Return microseconds of problem, solution, results and all, medians of the steps."""
+        times, clock = np.empty((len(q), 4)), time.perf_counter_ns
         for i in range(len(q)):
             if i % every == 0:
                 arm.set_goal(given["posture"][i], given["pose"][i])
@@ -151,8 +151,9 @@ def answer(given: Arrays, _: str, urdf: Path) -> tuple[Arrays, Callable[[], Time
             solution = arm.solver.solve(data)
             third = clock()
             arm.problem.getAccelerations(solution), arm.problem.getActuatorForces(solution)
-            parts += second - first, third - second, clock() - third
-        return tuple(1e6 * parts / len(q))
+            last = clock()
+            times[i] = second - first, third - second, last - third, last - first
+        return tuple(1e-3 * np.median(times, axis=0))
 
     return {"a": a, "tau": tau, "bounds": np.stack([lower, upper], axis=1)}, timed
 

@@ -14,7 +14,7 @@ Ratios compare programs that run in turns in one process. NAME --help lists opti
               machine itself can do; with --loads limits kept while the machine is busy or programs
               stop (20 min)
   peers       limits kept beside TSID, placo and a clamp
-  step        one controller step, part by part; with --tsid beside TSID's
+  step        one controller step; with --stages by stage, beside TSID's
   bounds      acceleration bounds: one arm, and batches
 
 TSID and placo are installed into .venv-tsid and .venv-placo.
