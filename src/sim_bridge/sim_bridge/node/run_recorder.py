@@ -114,7 +114,8 @@ class RunRecorder:
         ):
             self.topics += (topic.name,)
             if file is None:
-                node.listen(topic, callback, _RECORDING_QOS)
+                named = joints if topic is JOINT_STATES else ()
+                node.listen(topic, callback, _RECORDING_QOS, named)
             else:
                 self._keep(file, node, topic.message, topic.name, callback, _RECORDING_QOS)
                 node.publisher_watch.add(node.resolve_topic_name(topic.name))

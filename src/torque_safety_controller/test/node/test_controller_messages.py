@@ -25,6 +25,7 @@ from node_chain import (
     pose_message,
     torque_for,
 )
+from rclpy.node import Node
 from rclpy.qos import qos_profile_system_default
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
@@ -74,6 +75,24 @@ def test_what_a_state_is_after_one_that_was_answered(stamp, q, now, arrival):
     assert arrives(stream, stamp, now, q) is arrival
     accepted = arrival in (Arrival.NEW, Arrival.RESTARTED)
     np.testing.assert_array_equal(stream.q, q if accepted else STATE)
+
+
+def test_a_gripper_on_the_same_topic_is_no_rival_but_a_second_robot_is(ros):
+    chain = NodeChain(ros)
+    chain.answer(10)
+    gripper, rival = (ros.add(Node(name, context=ros.context)) for name in ("gripper", "rival"))
+    fingers_of = gripper.create_publisher(JointState, "joint_states", 1)
+    ros.wait_until(lambda: "publishers of '/joint_states'" in chain.reported("message"), "a rival")
+    fingers = joint_state(["finger"], 10 * MS, [0.02], [0.0], [0.0])
+    chain.await_command(20, lambda: (fingers_of.publish(fingers), chain.both(20)))
+    ros.wait_until(lambda: "publishers of" not in chain.reported("message"), "no rival")
+    assert chain.reported("states_refused") == "none"
+    rival.create_publisher(JointState, "joint_states", 1)
+    ros.wait_until(lambda: "3 publishers of" in chain.reported("message"), "the rival")
+    chain.both(30)
+    fingers_of.publish(fingers)
+    ros.run_for(0.1)
+    assert 30 * MS not in chain.commands.stamps
 
 
 # Limits

@@ -113,7 +113,7 @@ class ControllerNode(ArmNode):
             self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         self._published = StatePublisher(self, self._controller.robot, config, base, self._states)
         ENABLE_TORQUE.serve(self, self._on_enable_torque)
-        self.listen_to_states(config.use_estimated_states, self._on_state)
+        self.listen_to_states(config.use_estimated_states, self._on_state, config.joints)
         self.listen(ACCELERATION_LIMITS, self._on_limits)
         period = min(config.bounds_timeout, config.state_timeout) / 4
         self._watchdog = steady_timer(self, period, self._watch)

@@ -9,7 +9,7 @@ from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 
 TOPIC = "/left/command"
 TOLD = "'/left/command' has 2 publishers: /left/arm, /left/{}; stop "
-GONE = "'/left/command' has no second publisher any more"
+GONE = "'/left/command' has no rival publisher any more"
 
 
 @pytest.fixture
@@ -66,3 +66,18 @@ def test_other_namespaces_and_topics_are_no_rivals(ros, watch):
     watch.check()
     assert watch.admits(TOPIC)
     assert not watch.rivals
+
+
+def test_a_publisher_of_something_else_does_not_count_until_their_number_changes(ros, watch):
+    gripper = rival_of(ros, "gripper")
+    ros.wait_until(lambda: not watch.admits(TOPIC), "the gripper")
+    assert not watch.admits(TOPIC, of_other=True)
+    assert watch.admits(TOPIC)
+    assert not watch.trouble
+    rival = rival_of(ros)
+    ros.wait_until(lambda: not watch.admits(TOPIC), "the rival")
+    ros.stop(gripper)
+    ros.wait_until(lambda: ros.probe.count_publishers(TOPIC) == 2, "its end")
+    assert not watch.admits(TOPIC)  # it may be the rival that is left
+    ros.stop(rival)
+    ros.wait_until(lambda: watch.admits(TOPIC), "the end")

@@ -74,7 +74,7 @@ class BoundsNode(ArmNode):
             joint_names=list(joints), points=[JointTrajectoryPoint(), JointTrajectoryPoint()]
         )
         self._limits = self.stream(ACCELERATION_LIMITS)
-        self.listen_to_states(config.use_estimated_states, self._on_state)
+        self.listen_to_states(config.use_estimated_states, self._on_state, config.joints)
         self._slow_states = SLOW_JOINT_STATES.publisher(self)
         self._slow_limits = SLOW_ACCELERATION_LIMITS.publisher(self)
         self._distances = LIMIT_DISTANCES.publisher(self)

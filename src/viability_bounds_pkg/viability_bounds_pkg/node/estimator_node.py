@@ -117,7 +117,7 @@ class EstimatorNode(ArmNode):
         self._answered = self._restarts = self.commands_heard = 0
         self._answer = JointState()
         self._estimates = self.stream(ESTIMATED_JOINT_STATES)
-        self.listen(JOINT_STATES, self._on_state)
+        self.listen(JOINT_STATES, self._on_state, joints=joints)
         self.listen(JOINT_COMMANDS, self._on_command)
         self._payload = PayloadSubscriber(self, payload)
         self._diagnostics = Diagnostics(self, self._report, self.publisher_watch)

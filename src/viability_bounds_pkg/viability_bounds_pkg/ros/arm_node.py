@@ -79,17 +79,35 @@ class ArmNode(Node):
         return stream
 
     def listen(
-        self, topic: Topic, callback: Callable[[Any], None], qos: QoSProfile | None = None
+        self,
+        topic: Topic,
+        callback: Callable[[Any], None],
+        qos: QoSProfile | None = None,
+        joints: Sequence[str] = (),
     ) -> None:
-        """Call `callback` with the messages of a stream while it has one publisher."""
-        obeyed = Input(self, topic, callback, self.publisher_watch, qos)
+        """Call `callback` with the messages of a stream while it has one publisher.
+
+        Args:
+            topic: of the stream.
+            callback: gets the messages.
+            qos: of the subscription; None for that of the topic.
+            joints: names; a publisher of messages that have none of them does not count.
+        """
+        known = set(joints)
+
+        def of_other(message: Any) -> bool:
+            return bool(known) and known.isdisjoint(message.name)
+
+        obeyed = Input(self, topic, callback, self.publisher_watch, qos, of_other)
         self.inputs.append(obeyed)
         self.publisher_watch.add(obeyed.topic_name)
 
-    def listen_to_states(self, estimated: bool, callback: Callable[[Any], None]) -> None:
+    def listen_to_states(
+        self, estimated: bool, callback: Callable[[Any], None], joints: Sequence[str]
+    ) -> None:
         """Call `callback` with the joint states that the node works on: estimated, or reported."""
         self.uses_estimates = estimated
-        self.listen(state_topic(estimated), callback)
+        self.listen(state_topic(estimated), callback, joints=joints)
 
     def announce(self, joints: Sequence[str], rate: float, what: str) -> None:
         """Log in one line what the node does, for which joints, and the topics that it uses.

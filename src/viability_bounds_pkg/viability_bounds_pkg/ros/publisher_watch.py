@@ -13,7 +13,10 @@ _PERIOD = 1.0
 class PublisherWatch:
     """Counts the publishers of topics: once a second on the steady clock, and at each message.
 
-    A node that was killed counts until the ROS graph forgets it, see ``fastdds.xml``.
+    A node that was killed counts until the ROS graph forgets it, see ``fastdds.xml``. ROS does not
+    tell which of the publishers sent a message. So where a message of something else comes, as of
+    a gripper's driver among joint states, one of two publishers is taken for that one's, until
+    their number changes.
 
     Args:
         node: logs a second publisher once when it has come, and once when it is gone.
@@ -25,6 +28,7 @@ class PublisherWatch:
     def __init__(self, node: Node) -> None:
         self.rivals: dict[str, tuple[str, ...]] = {}
         self._topics: list[str] = []
+        self._shared: set[str] = set()
         self._node = node
         # Faster than the node's own, which expands the name at each call.
         self._count = node.handle.get_count_publishers
@@ -42,12 +46,22 @@ class PublisherWatch:
             for topic, names in self.rivals.items()
         )
 
-    def admits(self, topic: str) -> bool:
-        """Return whether a message that has just come is to be obeyed: nobody else publishes."""
-        alone: bool = self._count(topic) <= 1
+    def admits(self, topic: str, of_other: bool = False) -> bool:
+        """Return whether a message that has just come is to be obeyed: nobody else publishes.
+
+        Args:
+            topic: its name, resolved.
+            of_other: whether the message is none that its reader is there for.
+        """
+        count = self._count(topic)
+        if count != 2:
+            self._shared.discard(topic)
+        elif of_other:
+            self._shared.add(topic)
+        alone: bool = count <= 1 + (topic in self._shared)
         if alone == (topic in self.rivals):
             self._check_topic(topic)
-        return alone
+        return alone and not (of_other and count > 1)
 
     def check(self) -> None:
         """Compare the graph with what was known."""
@@ -56,13 +70,13 @@ class PublisherWatch:
 
     def _check_topic(self, topic: str) -> None:
         names: list[str] = []
-        if self._count(topic) > 1:
+        if self._count(topic) > 1 + (topic in self._shared):
             names = sorted(
                 f"{each.node_namespace.rstrip('/')}/{each.node_name}"
                 for each in self._node.get_publishers_info_by_topic(topic)
             )
         known = topic in self.rivals
-        if len(names) > 1:
+        if len(names) > 1 + (topic in self._shared):
             self.rivals[topic] = tuple(names)
             if not known:
                 self._node.get_logger().warning(
@@ -72,4 +86,4 @@ class PublisherWatch:
                 )
         elif known:
             del self.rivals[topic]
-            self._node.get_logger().info(f"'{topic}' has no second publisher any more")
+            self._node.get_logger().info(f"'{topic}' has no rival publisher any more")

@@ -66,6 +66,7 @@ class Input:
         callback: gets them.
         watch: tells whether there is one publisher.
         qos: of the subscription; None for that of the topic.
+        of_other: whether a message is of something else, whose publisher does not count.
 
     Attributes:
         listeners: the callback, and those of other nodes of the process that share the
@@ -80,16 +81,17 @@ class Input:
         callback: Listener,
         watch: PublisherWatch,
         qos: QoSProfile | None = None,
+        of_other: Callable[[Any], bool] = lambda _: False,
     ) -> None:
         self.listeners = [callback]
-        self._node, self._watch = node, watch
+        self._node, self._watch, self._of_other = node, watch, of_other
         self._subscription = node.create_subscription(
             topic.message, topic.name, self._receive, qos or topic.qos
         )
         self.topic_name: str = self._subscription.topic_name
 
     def _receive(self, message: Any) -> None:
-        if self._watch.admits(self.topic_name):
+        if self._watch.admits(self.topic_name, self._of_other(message)):
             for listener in self.listeners:
                 listener(message)
 
