@@ -232,7 +232,7 @@ class Page:
     def _on_leave(self, _: Any) -> None:
         """End driving when nobody has the page open any more."""
         if not self._server.get_clients():
-            self._drive.value = False  # its callback follows
+            self._drive.value = False  # type: ignore[misc]  # its callback follows
 
     def _on_goal(self, event: viser.TransformControlsEvent) -> None:
         self._dragging = event.phase != "end"

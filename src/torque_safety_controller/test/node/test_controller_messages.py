@@ -84,8 +84,12 @@ def test_a_gripper_on_the_same_topic_is_no_rival_but_a_second_robot_is(ros):
     fingers_of = gripper.create_publisher(JointState, "joint_states", 1)
     ros.wait_until(lambda: "publishers of '/joint_states'" in chain.reported("message"), "a rival")
     fingers = joint_state(["finger"], 10 * MS, [0.02], [0.0], [0.0])
-    chain.await_command(20, lambda: (fingers_of.publish(fingers), chain.both(20)))
-    ros.wait_until(lambda: "publishers of" not in chain.reported("message"), "no rival")
+    ros.wait_until(
+        lambda: "publishers of" not in chain.reported("message"),
+        "no rival",
+        each=lambda: fingers_of.publish(fingers),
+    )
+    chain.answer(20)
     assert chain.reported("states_refused") == "none"
     rival.create_publisher(JointState, "joint_states", 1)
     ros.wait_until(lambda: "3 publishers of" in chain.reported("message"), "the rival")

@@ -169,7 +169,9 @@ class ArmClient:
         self._heard.clear()
         for topic in _STATE:
             name = topic.name
-            self._wait(lambda n=name: n in self._heard, self._timeout, f"nothing on '{name}'")
+            self._wait(
+                partial(self._heard.__contains__, name), self._timeout, f"nothing on '{name}'"
+            )
         (q, v, tau), margins = map(self._by_joint, (JOINT_STATES, LIMIT_DISTANCES))
         if np.isnan(q).any():
             missing = self._joints[int(np.isnan(q).argmax())]
