@@ -182,6 +182,8 @@ class ControllerNode(ArmNode):
             self._goals.base_moved(self._base * before.inverse())
         for line in locked.news():
             self.get_logger().info(line)
+        for line in locked.refused():
+            self._warn(line)
 
     def _on_limits(self, message: JointTrajectory) -> None:
         if not self._limits.read(message):

@@ -89,20 +89,25 @@ def test_a_position_of_one_message_alone_does_not_count():
     joints, model, _ = locked()
     joints.look([LIFT], [0.1], S)
     before = model.copy()
-    assert not joints.look([LIFT], [0.9], S + S // 10)
+    assert not joints.look([LIFT], [0.65], S + S // 10)
     assert joints.moving == LIFT
     assert not joints.look([LIFT], [0.1], S + 2 * S // 10)
     assert model == before
-    assert not joints.look([LIFT], [0.9], S + 3 * S // 10)
-    assert joints.look([LIFT], [0.9], S + 4 * S // 10)
+    assert not joints.look([LIFT], [0.65], S + 3 * S // 10)
+    assert joints.look([LIFT], [0.65], S + 4 * S // 10)
 
 
 @pytest.mark.parametrize(
     ("names", "positions"),
-    [(["arm_1_joint"], [0.5]), ([LIFT], [math.nan]), ([LIFT], []), ([], [])],
+    [(["arm_1_joint"], [0.5]), ([LIFT], [math.nan]), ([LIFT], [300.0]), ([LIFT], []), ([], [])],
 )
 def test_states_without_the_joints_change_nothing(names, positions):
     joints, model, _ = locked()
     before = model.copy()
     assert not joints.look(names, positions, S)
     assert model == before
+    refused = [name for name, _ in zip(names, positions, strict=False) if name == LIFT]
+    (line,) = joints.refused() or [""]
+    assert all(f"the position of {name} is no number, or beyond" in line for name in refused)
+    assert bool(line) == bool(refused)
+    assert not joints.refused()

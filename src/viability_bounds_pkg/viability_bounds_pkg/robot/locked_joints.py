@@ -35,7 +35,8 @@ class LockedJoints:
     """Keeps a model to where its locked joints are: those before the joints or frames that count.
 
     Joints on other branches, such as wheels, and those beyond, such as fingers, stay where they
-    are locked.
+    are locked; and so does the model of positions that are beyond the limits by more than their
+    range: they are of another unit.
 
     Args:
         config: which robot it is.
@@ -70,6 +71,12 @@ class LockedJoints:
             for j in sorted((arm | root) - {0, *joints})
             if full.joints[j].nq == 1
         }
+        low, high = full.lowerPositionLimit, full.upperPositionLimit
+        self._possible = {
+            name: (low[k] - width, high[k] + width)
+            for name, k in self._index.items()
+            for width in [high[k] - low[k] if name not in self._continuous else math.inf]
+        }
         self._between = {full.names[j] for j in arm ^ root}
         units = units_of(urdf, list(self._index))
         self._units = dict(zip(self._index, units, strict=True))
@@ -78,6 +85,7 @@ class LockedJoints:
         self._full = full
         self._seen: Mapping[str, float] = {}
         self._steady = False
+        self._impossible: dict[str, bool] = {}  # whether that was told
         self._told = {name: float(self._q[k]) for name, k in self._index.items()}
         self._stamp = self._moved_at = -math.inf
         self.moving = ""
@@ -121,13 +129,27 @@ class LockedJoints:
         found = {}
         for name, k in self._index.items():
             position = given.get(name, math.nan)
-            if not math.isfinite(position):
+            low, high = self._possible[name]
+            if not (math.isfinite(position) and low <= position <= high):
+                if name in given:
+                    self._impossible.setdefault(name, False)
                 continue
             if name in self._continuous:
                 here = float(self._q[k])
                 position = here + math.remainder(position - here, math.tau)
             found[name] = position
         return found
+
+    def refused(self) -> list[str]:
+        """Return whose position is no number, or beyond the range of the joint, a line, once."""
+        lines = []
+        for name in [name for name, told in self._impossible.items() if not told]:
+            self._impossible[name] = True
+            lines.append(
+                f"the position of {name} is no number, or beyond its limits by more than their "
+                f"range: {self._units[name]}? It is not used in the model"
+            )
+        return lines
 
     def news(self) -> list[str]:
         """Return where joints stand now that the model goes by, a line each, once."""
