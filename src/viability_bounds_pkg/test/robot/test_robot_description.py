@@ -35,6 +35,19 @@ def test_a_joint_that_slides_needs_position_limits():
         check_with_urdf(config, urdf.format("prismatic"))
 
 
+def test_a_joint_that_is_locked_outside_its_limits_is_told():
+    values = {"robot_description": "topic", "joints": ["a"], "torque_max": [50.0]}
+    values |= {"position_min": [-1.0], "position_max": [1.0], "locked_joints": ["waist"]}
+    urdf = """<robot name="x"><joint name="a" type="revolute"/>
+        <joint name="waist" type="revolute"><limit lower="-1.3" upper="1.3"/></joint></robot>"""
+    inside, outside = (
+        check_with_urdf(read(RobotConfiguration, values | {"locked_positions": [q]}), urdf)
+        for q in (1.3, 45.0)
+    )
+    assert not inside
+    assert "is 45 for waist, outside its limits in the URDF, -1.3 to 1.3" in outside[0]
+
+
 def test_rotors_are_on_the_diagonal_of_the_inertia_matrix(urdf):
     rng = np.random.default_rng(1)
     with_rotors, without = build_model(urdf, JOINTS, None, ROTORS), build_model(urdf, JOINTS)

@@ -258,7 +258,22 @@ def check_with_urdf(config: RobotConfiguration, urdf: str) -> list[str]:
     """
     elements = _urdf_joints(urdf, config.joints)
     lines = [line for j, joint in enumerate(elements) for line in _unusual(config, j, joint)]
-    return lines + inertial_oddities(ElementTree.fromstring(urdf), config.joints)
+    root = ElementTree.fromstring(urdf)
+    lines += _unusual_locked(config, root)
+    return lines + inertial_oddities(root, config.joints)
+
+
+def _unusual_locked(config: RobotConfiguration, root: ElementTree.Element) -> Iterator[str]:
+    joints = {each.get("name", ""): each for each in root.iterfind("joint")}
+    for name, q in config.locked.items():
+        joint = joints.get(name)
+        low, high = (None if joint is None else _limit(joint, key) for key in ("lower", "upper"))
+        if low is None or high is None or low - _SLACK <= q <= high + _SLACK:
+            continue
+        yield (
+            f"parameter 'locked_positions' is {q:g} for {name}, outside its limits in the URDF, "
+            f"{low:g} to {high:g}"
+        )
 
 
 def _unusual(config: RobotConfiguration, j: int, joint: ElementTree.Element) -> Iterator[str]:
