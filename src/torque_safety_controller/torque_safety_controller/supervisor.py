@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.command_check import CommandCheck
+from torque_safety_controller.kept_rate import KeptRate
 from torque_safety_controller.modes import CAUSES, CHANGES, Control, Goals, Mode
 from torque_safety_controller.ramp import Ramp
 
@@ -65,7 +66,8 @@ class Supervisor:
         pause: time without an answer after which the robot has stopped itself, s.
         commands: detects commands that do not act; None to presume that they do.
         tell: told mode and reason when one of them has changed.
-        warn: told in words when the arm is slowed, and when it goes on.
+        warn: told in words when the arm is slowed, when it goes on, and when the machine does not
+            keep the control rate.
 
     Attributes:
         mode, reason: present ones.
@@ -86,6 +88,7 @@ class Supervisor:
         self._dt, self._covered, self._pause = dt, covered, pause
         self._commands, self._tell, self._warn = commands, tell, warn
         self._ramp = Ramp(dt)
+        self._kept = KeptRate(dt, covered, warn)
         self._slowed_by = ""
         self._giving_back_for = self._ignored_for = 0.0
         self._rows_too_long = self._longest_row = 0
@@ -211,6 +214,8 @@ class Supervisor:
         """Return whether more states were not answered than the bounds cover."""
         row = round(elapsed / self._dt) - 1
         self._longest_row = max(self._longest_row, row)
+        if row >= 0 and elapsed <= self._pause:
+            self._kept.add(row)
         if row <= self._covered:
             return False
         self._rows_too_long += 1

@@ -50,6 +50,12 @@ RETRY_PERIOD = 0.03
 AHEAD = 20
 """Periods that a robot in lockstep goes on without its recorder; a socket's buffer keeps more."""
 
+SLOW_AFTER = 2.0
+"""After which the rate that the machine keeps is known, s."""
+
+SLOW = 0.95
+"""Share of the control rate below which the machine is too slow."""
+
 _CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
 
 
@@ -107,6 +113,7 @@ class BulletNode(ArmNode):
         )
         self._ft_wrench = WrenchStamped()
         self._ft_publisher = self.stream(FT_WRENCH) if self._robot.sensor else None
+        self._told_slow = False
         self._sensing = Sensing(config.imperfections, config.torque_max, config.dt)
         self._commands = CommandStream(config, self._refused, self.get_logger().warning)
         self._restart()
@@ -359,6 +366,8 @@ class BulletNode(ArmNode):
             "lower_clearance_rad": monitor.closest_to_q_min,
             "upper_clearance_rad": monitor.closest_to_q_max,
         }
+        if not self._paused and elapsed > SLOW_AFTER:
+            self._tell_slow(values["rate_hz"])
         if monitor.violated:
             return DiagnosticStatus.ERROR, "a limit was broken", values
         if self._paused:
@@ -369,6 +378,17 @@ class BulletNode(ArmNode):
             doing = "braking" if control == "brakes" else control
             return DiagnosticStatus.WARN, f"{doing}: no commands", values
         return DiagnosticStatus.OK, "running", values
+
+    def _tell_slow(self, kept: float) -> None:
+        """Tell once that the machine simulates fewer periods than real time has."""
+        rate = self._config.rate_hz
+        if self._told_slow or self._config.lockstep or kept > SLOW * rate:
+            return
+        self._told_slow = True
+        self.get_logger().warning(
+            f"the simulation keeps {kept:.0f} of {rate:g} Hz here: set rate_hz of all nodes to "
+            f"{rate / math.ceil(rate / kept):.4g}, or clock to lockstep"
+        )
 
     def destroy_node(self) -> None:
         """Disconnect from the physics engine too."""

@@ -139,6 +139,28 @@ def test_rows_of_missed_states_are_counted_and_told_once():
     ]
 
 
+@pytest.mark.parametrize(
+    ("rows", "line"),
+    [
+        ((0, 1), "keeps 67 of 100 Hz here: set rate_hz to 50 (and the robot's)"),
+        ((0, 1, 1, 5), "keeps 37 of 100 Hz here: set rate_hz to 33.33 (and the robot's), or "
+         "missed_deadlines to 5"),
+        ((0,), ""),
+        ((1,), ""),  # the robot has another rate
+        ((0,) * 99 + (15,), ""),  # accidents
+    ],
+)  # fmt: skip
+def test_a_machine_that_does_not_keep_the_rate_tells_after_two_seconds_what_to_set(rows, line):
+    chain = Chain()
+    chain.answer(None)
+    for second in range(4):
+        for _ in range(math.ceil(1.0 / (DT * (len(rows) + sum(rows))))):
+            for row in rows:
+                chain.answer((1 + row) * DT)
+        told = [each for each in chain.warned if "keeps" in each]
+        assert told == [line] * (bool(line) and second > 0)
+
+
 def test_a_pause_in_which_the_robot_stops_itself_holds_the_arm_until_it_rests():
     chain = Chain()
     chain.answer(None)
