@@ -27,6 +27,7 @@ from torque_safety_controller.supervisor import Order
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
+_SERVE = Order()
 Kind = TypeVar("Kind")
 
 
@@ -57,6 +58,14 @@ class Controller:
     ) -> None:
         self.robot = robot
         self.parts = tuple(parts)
+        self._prepare, self._choose, self._learn = (
+            [getattr(part, name) for part in parts if getattr(type(part), name) is not nothing]
+            for name, nothing in (
+                ("prepare", Part.prepare),
+                ("choose", Part.choose),
+                ("learn", Part.learn),
+            )
+        )
         self.hold_kd = hold_kd
         (self.goals,) = (part for part in parts if isinstance(part, Goals))
         self._limiter = TorqueLimiter(tau_max, torque_rate_max, robot.dt)
@@ -110,10 +119,10 @@ class Controller:
             elapsed: time since the last step, s; None for a control period.
         """
         elapsed = self.robot.dt if elapsed is None else elapsed
-        step = self._decide(state, limits, order or Order(), elapsed)
+        step = self._decide(state, limits, order or _SERVE, elapsed)
         self._command(step)
-        for part in self.parts:
-            part.learn(step)
+        for learn in self._learn:
+            learn(step)
         return step
 
     def resume(self, state: State, limits: AccelerationRange, tau: Array) -> Step:
@@ -134,7 +143,7 @@ class Controller:
         before = self.goals.targets, self.goals.posture
         self.reset(state.q)
         self.goals.hold_here(self.robot)
-        step = self._decide(state, limits, Order(), elapsed=0.0)
+        step = self._decide(state, limits, _SERVE, elapsed=0.0)
         if not step.failure and not np.isfinite(tau).all():
             step.failure = "the torque of the motors is not finite"
         if step.failure:
@@ -173,8 +182,8 @@ class Controller:
         """Return a step of which the accelerations to command are known."""
         self.robot.update(state, self._a_last)
         step = Step(self.robot, limits, order, elapsed, self.tau_max, self._a_last, self.hold_kd)
-        for part in self.parts:
-            part.prepare(step)
+        for prepare in self._prepare:
+            prepare(step)
         try:
             step.solution = self._solve(step)
             a = step.solution.a
@@ -183,8 +192,8 @@ class Controller:
             a = step.rest
             if not np.isfinite(step.torque).all():
                 step.torque = np.zeros(self.robot.n)
-        for part in self.parts:
-            a = part.choose(step, a)
+        for choose in self._choose:
+            a = choose(step, a)
         step.a = a if math.isfinite(a.dot(a)) else np.zeros(self.robot.n)
         return step
 
@@ -197,9 +206,9 @@ class Controller:
         Raises:
             NoSolutionFound: numbers that are not finite or absurd, or no task with a weight.
         """
-        bias, d = self.robot.h + step.torque, step.disturbance
-        low, high = self._limiter.range()
-        terms = [task.term(self.robot) for task in step.tasks]
+        robot, d = self.robot, step.disturbance
+        low, high = self._limiter.range() - (robot.h + step.torque)
+        terms = [task.term(robot) for task in step.tasks]
         rows = stack_constraints(
             [
                 LinearConstraints(G, lower - G @ d, upper - G @ d)
@@ -208,11 +217,8 @@ class Controller:
         )
 
         def solve(bounds: AccelerationRange, rows: LinearConstraints | None) -> Solution:
-            return self._qp.solve(
-                self._qp.build(
-                    terms, bounds, self.robot.M, low - bias, high - bias, rows, step.forces
-                )
-            )
+            qp = self._qp
+            return qp.solve(qp.build(terms, bounds, robot.M, low, high, rows, step.forces))
 
         bounds = step.commanded(step.bounds)
         if step.eased is not None:

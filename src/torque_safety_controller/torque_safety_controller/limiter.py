@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 
@@ -24,7 +25,7 @@ class TorqueLimiter:
 
     def __init__(self, tau_max: ArrayLike, tau_rate_max: ArrayLike | None, dt: float) -> None:
         self.tau_max = np.array(tau_max, dtype=float)
-        self._tau_min = -self.tau_max
+        self._limits = np.stack([-self.tau_max, self.tau_max])
         rate = np.asarray(math.inf if tau_rate_max is None else tau_rate_max, dtype=np.float64)
         self._step = np.where(np.isinf(rate), np.inf, rate * dt)
         self._rate_limited = bool(np.isfinite(rate).any())
@@ -36,22 +37,33 @@ class TorqueLimiter:
 
     def continue_from(self, tau: np.ndarray) -> np.ndarray:
         """Set the last torque to `tau`, shape (n,), N m, clipped to the limits; return it."""
-        self.last = np.clip(tau, self._tau_min, self.tau_max)
+        self.last = np.clip(tau, *self._limits)
         return self.last
 
-    def range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the limits of the next torque, shape (n,) each, N m."""
+    def range(self) -> np.ndarray:
+        """Return the lower and the upper limits of the next torque, shape (2, n), N m."""
         if self.last is None or not self._rate_limited:
-            return self._tau_min, self.tau_max
-        return (
-            np.maximum(self._tau_min, self.last - self._step),
-            np.minimum(self.tau_max, self.last + self._step),
-        )
+            return self._limits
+        reach = np.stack([self.last - self._step, self.last + self._step])
+        return np.clip(reach, *self._limits)
 
     def limited(self, tau: np.ndarray) -> np.ndarray:
         """Return `tau` clipped to the limits; the last torque in place of one not finite."""
-        if not math.isfinite(tau.dot(tau)):
-            tau = np.zeros(self.tau_max.size) if self.last is None else self.last
-        lower, upper = self.range()
-        self.last = np.minimum(np.maximum(tau, lower), upper)
-        return self.last
+        limited = np.zeros(self.tau_max.size)
+        if not _clip(tau, self.range(), limited):
+            _clip(limited if self.last is None else self.last, self.range(), limited)
+        self.last = limited
+        return limited
+
+
+@njit(cache=True)
+def _clip(tau: np.ndarray, limits: np.ndarray, limited: np.ndarray) -> bool:
+    """Write `tau` within its limits; return whether it is finite, else nothing is written."""
+    square = 0.0
+    for torque in tau:
+        square += torque * torque
+    if not math.isfinite(square):
+        return False
+    for j in range(tau.size):
+        limited[j] = min(max(tau[j], limits[0, j]), limits[1, j])
+    return True

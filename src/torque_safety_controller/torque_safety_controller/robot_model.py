@@ -98,6 +98,7 @@ class RobotModel(FrameModel):
         self.n = model.nv
         self.data = model.createData()
         self._zero = np.zeros(self.n)
+        self._middle = np.zeros(self.n), np.zeros(self.n)
         self.q: Array = self._zero
         self.M = np.eye(self.n)
         self.h = np.zeros(self.n)
@@ -114,7 +115,8 @@ class RobotModel(FrameModel):
         model, data = self.model, self.data
         q, v = self.q, self.v = state
         self.a_last = a_last
-        q_mid, v_mid = _middle_of_step(q, v, a_last, self.dt)
+        q_mid, v_mid = self._middle
+        _middle_of_step(q, v, a_last, self.dt, q_mid, v_mid)
         self.M = pin.crba(model, data, q_mid)
         self.h = pin.nonLinearEffects(model, data, q_mid, v_mid)
         if self.rates:
@@ -139,14 +141,16 @@ class RobotModel(FrameModel):
         From `state` on; None for the current one.
         """
         q, v = state or (self.q, self.v)
-        q_mid, v_mid = _middle_of_step(q, v, a, self.dt)
+        q_mid, v_mid = self._middle
+        _middle_of_step(q, v, a, self.dt, q_mid, v_mid)
         tau: Array = pin.rnea(self.model, self.data, q_mid, v_mid, a)
         return tau
 
 
 @njit(cache=True)
-def _middle_of_step(q: Array, v: Array, a: Array, dt: float) -> tuple[Array, Array]:
-    """Return position and velocity after dt / 2 at acceleration `a`, shape (n,) each."""
+def _middle_of_step(q: Array, v: Array, a: Array, dt: float, q_mid: Array, v_mid: Array) -> None:
+    """Write position and velocity after dt / 2 at acceleration `a`, shape (n,) each."""
     half = 0.5 * dt
-    change = half * a
-    return q + half * (v + 0.5 * change), v + change
+    for j in range(q.size):
+        change = half * a[j]
+        q_mid[j], v_mid[j] = q[j] + half * (v[j] + 0.5 * change), v[j] + change

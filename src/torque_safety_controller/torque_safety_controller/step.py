@@ -63,6 +63,16 @@ class Step:
         tau: torque commanded, shape (n,), N m.
     """
 
+    # What most steps begin and end with.
+    tracking = False
+    stiffness: Array | None = None
+    eased: AccelerationRange | None = None
+    forces: ContactForces | None = None
+    fallback: Array | None = None
+    planned = True
+    solution: Solution | None = None
+    failure = ""
+
     def __init__(
         self,
         robot: RobotModel,
@@ -81,20 +91,12 @@ class Step:
         self.a_last = a_last
         self.rest: Array = -hold_kd * robot.v
         self.tasks: list[Task] = []
-        self.tracking = False
-        self.stiffness: Array | None = None
+        self.rows: dict[Part, LinearConstraints] = {}
+        self.bounds = _unbounded(robot.n)
         nothing = np.zeros(robot.n)
         self.torque: Array = nothing
         self.integral_change: Array = nothing
         self.disturbance: Array = nothing
-        self.bounds = _unbounded(robot.n)
-        self.eased: AccelerationRange | None = None
-        self.rows: dict[Part, LinearConstraints] = {}
-        self.forces: ContactForces | None = None
-        self.fallback: Array | None = None
-        self.planned = True
-        self.solution: Solution | None = None
-        self.failure = ""
         self.a: Array = nothing
         self.tau: Array = nothing
 
@@ -115,7 +117,9 @@ class Step:
         For one upwards the upper bound is lowered, and else the lower one raised; if they cross,
         the other one follows.
         """
-        return AccelerationRange(*_narrowed(self.disturbance, bounds.lower, bounds.upper))
+        lower, upper = np.empty((2, self.robot.n))
+        _narrow(self.disturbance, bounds.lower, bounds.upper, lower, upper)
+        return AccelerationRange(lower, upper)
 
     def relaxation_of(self, part: Part) -> Array | None:
         """Return by how much the QP relaxed the rows of a part, in their units; None for not."""
@@ -178,18 +182,16 @@ def _unbounded(n: int) -> AccelerationRange:
 
 
 @njit(cache=True)
-def _narrowed(disturbance: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return bounds of the commanded accelerations, see `Step.commanded`."""
-    low, high = lower.copy(), upper.copy()
+def _narrow(disturbance: Array, lower: Array, upper: Array, low: Array, high: Array) -> None:
+    """Write bounds of the commanded accelerations to `low` and `high`, see `Step.commanded`."""
     for j in range(low.size):
         e = disturbance[j]
         if e > 0.0:
-            high[j] -= e
-            low[j] = min(low[j], high[j])
+            high[j] = upper[j] - e
+            low[j] = min(lower[j], high[j])
         else:
-            low[j] -= e
-            high[j] = max(low[j], high[j])
-    return low, high
+            low[j] = lower[j] - e
+            high[j] = max(low[j], upper[j])
 
 
 def joints_beyond(model: pin.Model, torque: Array, most: Array) -> str:

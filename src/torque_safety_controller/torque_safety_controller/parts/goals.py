@@ -77,7 +77,9 @@ class Goals(Part):
     def any(self) -> bool:
         """Whether there is something to track."""
         goals = self.targets
-        return any(each is not None for each in (goals.pose, goals.q, *goals.others))
+        if goals.pose is not None or goals.q is not None:
+            return True
+        return any(other is not None for other in goals.others)
 
     @property
     def pose_des(self) -> pin.SE3 | None:

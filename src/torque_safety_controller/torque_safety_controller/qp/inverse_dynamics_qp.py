@@ -9,7 +9,6 @@ possible, in the sense of least squares.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -110,44 +109,50 @@ class InverseDynamicsQP:
             ValueError: constraints or contacts of the wrong shape.
         """
         n = self._n
-        G, row_lower, row_upper = constraints or _no_rows(n)
-        B, rho_max, wrench_tasks = contacts or _no_forces(n)
-        k, r = len(G), len(rho_max)
-        size = n + r
-        if G.shape != (len(row_lower), n) or row_lower.shape != row_upper.shape:
-            raise ValueError(
-                f"constraints on {n} joints with G {G.shape}, lower {row_lower.shape}, "
-                f"upper {row_upper.shape}"
-            )
-        if B.shape != (n, r):
-            raise ValueError(f"forces on {n} joints with B {B.shape}, rho_max {rho_max.shape}")
-        weights = [task.weight for task in tasks] + [task.weight for task in wrench_tasks]
+        weights = [task.weight for task in tasks]
+        k = r = 0
+        if constraints is not None:
+            G, row_lower, row_upper = constraints
+            k = len(G)
+            if G.shape != (len(row_lower), n) or row_lower.shape != row_upper.shape:
+                raise ValueError(
+                    f"constraints on {n} joints with G {G.shape}, lower {row_lower.shape}, "
+                    f"upper {row_upper.shape}"
+                )
+        if contacts is not None:
+            B, rho_max, wrench_tasks = contacts
+            r = len(rho_max)
+            if B.shape != (n, r):
+                raise ValueError(f"forces on {n} joints with B {B.shape}, rho_max {rho_max.shape}")
+            weights += [task.weight for task in wrench_tasks]
         greatest = max([0.0, *weights])
         if greatest == 0.0:
             raise NoSolutionFound("no task with a weight above 0")
+        size = n + r
+        H, g, C = np.zeros((size, size)), np.zeros(size), np.zeros((n + k, size))
+        lower, upper = np.zeros((2, size + n + k))
         # Mostly one task is of the joints: it is written at once.
-        joints = next((task for task in tasks if task.A is None), None)
-        b, share = (tau_lower, 0.0) if joints is None else (joints.b, joints.weight / greatest)
-        H, g, C, lower, upper = _plain(
-            r, k, self._gamma, *bounds, M, tau_lower, tau_upper, b, share
-        )
-        if r:
-            C[:n, n:] = -B
-            upper[n:size] = rho_max
-        if k:
-            C[n:, :n] = G
-            lower[size + n :] = row_lower
-            upper[size + n :] = row_upper
+        joints = [task for task in tasks if task.A is None]
+        b, share = (joints[0].b, joints[0].weight / greatest) if joints else (tau_lower, 0.0)
+        _write(H, g, C, lower, upper, self._gamma, *bounds, M, tau_lower, tau_upper, b, share)
+        for task in joints[1:]:
+            H[range(n), range(n)] += task.weight / greatest
+            g[:n] -= task.weight / greatest * task.b
         for task in tasks:
             if task.A is not None:
                 _add_least_squares(H, g, task.A, task.b, task.weight / greatest, 0)
-            elif task is not joints:
-                H[range(n), range(n)] += task.weight / greatest
-                g[:n] -= task.weight / greatest * task.b
-        for W, F_des, weight in wrench_tasks:
-            if W.shape != (*F_des.shape, r):
-                raise ValueError(f"wrench task of {r} forces, W {W.shape}, F_des {F_des.shape}")
-            _add_least_squares(H, g, W, F_des, weight / greatest, n)
+        if constraints is not None:
+            C[n:, :n] = G
+            lower[size + n :] = row_lower
+            upper[size + n :] = row_upper
+        if contacts is not None:
+            C[:n, n:] = -B
+            upper[n:size] = rho_max
+            for W, F_des, weight in wrench_tasks:
+                if W.shape != (*F_des.shape, r):
+                    shapes = f"W {W.shape}, F_des {F_des.shape}"
+                    raise ValueError(f"wrench task of {r} forces, {shapes}")
+                _add_least_squares(H, g, W, F_des, weight / greatest, n)
         return QuadraticProgram(H, g, C, lower, upper)
 
     def solve(self, program: QuadraticProgram) -> Solution:
@@ -184,23 +189,16 @@ class InverseDynamicsQP:
         return x, iterations + result.iterations
 
 
-@lru_cache
-def _no_rows(n: int) -> LinearConstraints:
-    return LinearConstraints(np.zeros((0, n)), np.zeros(0), np.zeros(0))
-
-
-@lru_cache
-def _no_forces(n: int) -> ContactForces:
-    return ContactForces(np.zeros((n, 0)), np.zeros(0))
-
-
 # Compiled, because they are called at every step and NumPy takes several times as long.
 
 
 @njit(cache=True)
-def _plain(
-    r: int,
-    k: int,
+def _write(
+    H: Array,
+    g: Array,
+    C: Array,
+    lower: Array,
+    upper: Array,
     gamma: float,
     a_lower: Array,
     a_upper: Array,
@@ -209,14 +207,15 @@ def _plain(
     tau_upper: Array,
     b: Array,
     weight: float,
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return H, g, C, lower, upper of a program in x = (a, rho) with C = (M, 0; 0, 0).
-
-    Its cost is ``gamma |x|^2 / 2 + weight |a - b|^2 / 2``.
+) -> None:
+    """Write limits of a and M a, and the cost ``gamma |x|^2 / 2 + weight |a - b|^2 / 2``.
 
     Args:
-        r: number of rho, with limits 0.
-        k: number of rows below M, with limits 0.
+        H: of zeros, as the next ones: of a `QuadraticProgram` in x = (a, rho).
+        g: shape (n + r,).
+        C: shape (n + k, n + r).
+        lower: shape (n + r + n + k,).
+        upper: same shape.
         gamma: weight of |x|^2.
         a_lower: limits of a, shape (n,).
         a_upper: shape (n,).
@@ -226,10 +225,7 @@ def _plain(
         b: shape (n,).
         weight: of the difference of a and b.
     """
-    n = len(a_lower)
-    size = n + r
-    H, g, C = np.zeros((size, size)), np.zeros(size), np.zeros((n + k, size))
-    lower, upper = np.zeros(size + n + k), np.zeros(size + n + k)
+    n, size = len(a_lower), len(g)
     for i in range(size):
         H[i, i] = gamma
     for i in range(n):

@@ -70,10 +70,10 @@ class PoseTask:
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``J a = kp error - kd J v - J' v + feedforward`` as a term of the cost."""
         frame: FrameModel = robot if self.hand is None else robot.others[self.hand]
-        pose, goal = frame.pose, self.pose_des
-        error = separate_error(pose, goal) if self.separate else pose_error(pose, goal)
-        twist, b = _spring_and_damper(
-            error,
+        pose, b = frame.pose, np.empty(6)
+        between = pose.actInv(self.pose_des)
+        _spring_and_damper(
+            pin.SE3ToXYZQUAT(between) if self.separate else pin.log6(between).vector,
             self.kp,
             self.kd,
             _ALL if self.stiffness is None else self.stiffness,
@@ -82,11 +82,12 @@ class PoseTask:
             frame.v,
             frame.drift,
             self.separate,
+            b,
         )
         if self.motion is not None and self.separate:
             b += self._separate_feedforward(pose, self.motion)
         elif self.motion is not None:
-            b += self._feedforward(pose, twist, self.motion)
+            b += self._feedforward(between, frame.J @ frame.v, self.motion)
         return TaskTerm(frame.J, b, self.weight)
 
     def _separate_feedforward(self, pose: pin.SE3, motion: PoseMotion) -> Array:
@@ -98,14 +99,13 @@ class PoseTask:
         turned: Array = (ahead @ self.pose_des.rotation.T @ pose.rotation).ravel()
         return turned
 
-    def _feedforward(self, pose: pin.SE3, twist: Array, motion: PoseMotion) -> Array:
+    def _feedforward(self, between: pin.SE3, twist: Array, motion: PoseMotion) -> Array:
         """Return what a goal in motion adds, shape (6,), in the end effector's axes.
 
         The goal's twist as seen at the end effector is X xi_des with X the action of the placement
         H^-1 H_des between them; it changes with rate ``X xi_des' - xi x (X xi_des)``, because the
         axes move with the twist xi of the end effector.
         """
-        between = pose.actInv(self.pose_des)
         seen = between.act(pin.Motion(motion.twist))
         rate = between.act(pin.Motion(motion.twist_rate)) - pin.Motion(twist).cross(seen)
         feedforward: Array = self.kd * seen.vector + rate.vector
@@ -123,9 +123,15 @@ def _spring_and_damper(
     v: Array,
     drift: Array,
     separate: bool,
-) -> tuple[Array, Array]:
-    """Return the twist J v and ``kp error - kd J v - J' v``, shape (6,) each, see `PoseTask`."""
-    twist, b = np.zeros(6), np.empty(6)
+    b: Array,
+) -> None:
+    """Write ``kp error - kd J v - J' v`` to b, shape (6,), see `PoseTask`.
+
+    The error is given as it is, or, with `separate`, as translation and quaternion, shape (7,).
+    """
+    if separate:
+        error = _with_rotation_vector(error)
+    twist = np.zeros(6)
     for i in range(6):
         for j in range(v.size):
             twist[i] += J[i, j] * v[j]
@@ -140,7 +146,17 @@ def _spring_and_damper(
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
             b[i] -= twist[3 + j] * twist[k] - twist[3 + k] * twist[j]
-    return twist, b
+
+
+@njit(cache=True)
+def _with_rotation_vector(place: Array) -> Array:
+    """Return translation and log(R), shape (6,), of a translation and a quaternion of R."""
+    error, w = place[:6].copy(), place[6]
+    sine = math.sqrt(place[3] ** 2 + place[4] ** 2 + place[5] ** 2)
+    # Of the two angles the one of at most half a turn; w is 1 where it is tiny.
+    angle = 2.0 * math.atan2(sine, abs(w))
+    error[3:] *= math.copysign(angle / sine if sine > 0.0 else 2.0, w)
+    return error
 
 
 def shorten(vector: Array, largest: float) -> None:
@@ -148,15 +164,6 @@ def shorten(vector: Array, largest: float) -> None:
     length = math.hypot(*vector.tolist())
     if length > largest:
         vector *= largest / length
-
-
-def separate_error(pose: pin.SE3, pose_des: pin.SE3) -> Array:
-    """Return ``(R'(p_d - p), log(R'R_d))``, shape (6,), m and rad, in the hand's axes."""
-    between = pose.actInv(pose_des)
-    error = np.empty(6)
-    error[:3] = between.translation
-    error[3:] = pin.log3(between.rotation)
-    return error
 
 
 def pose_error(pose: pin.SE3, pose_des: pin.SE3) -> Array:

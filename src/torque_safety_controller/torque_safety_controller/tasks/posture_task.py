@@ -47,28 +47,31 @@ class PostureTask:
 
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``a = kp (q_des - q) - kd v + feedforward`` as a term of the cost."""
-        pull = self.kp * (self.q_des - robot.q)
-        hands = [robot.J] if self.in_null_space else []
-        hands += [robot.others[hand].J for hand in self.others]
-        if hands:
-            # Regularised where J has lost rank; there it leaves in what the pose cannot feel.
-            J = hands[0] if len(hands) == 1 else np.vstack(hands)
-            pull = _in_null_space(J, pull)
-        b = pull - self.kd * robot.v
+        b = np.empty(len(self.q_des))
+        J = robot.J if self.in_null_space else None
+        if self.others:
+            hands = [robot.others[hand].J for hand in self.others]
+            J = np.vstack(hands if J is None else [J, *hands])
+        _spring_and_damper(self.q_des, robot.q, robot.v, self.kp, self.kd, J, b)
         if self.feedforward is not None:
             b = b + self.feedforward
         return TaskTerm(None, b, self.weight)
 
 
 @njit(cache=True)
-def _in_null_space(J: Array, a: Array) -> Array:
-    """Return what of accelerations moves no hand, ``a - J' (J J' + r I)^-1 J a``, shape (n,).
+def _spring_and_damper(
+    q_des: Array, q: Array, v: Array, kp: float, kd: float, J: Array | None, b: Array
+) -> None:
+    """Write ``P kp (q_des - q) - kd v`` to b, shape (n,).
 
-    All of `a` where it or J, shape (m, n), is not finite. Compiled, because NumPy takes
-    four times as long.
+    P leaves what moves no hand, ``I - J' (J J' + r I)^-1 J`` with J of shape (m, n); r counts
+    where J has lost rank, and there leaves in what the pose cannot feel. P is I without J, and
+    where numbers are not finite. Compiled, because NumPy takes four times as long.
     """
-    inner = J @ J.T + _RANK_REGULARISATION * np.eye(len(J))
-    moved = J @ a
-    if not (np.isfinite(inner).all() and np.isfinite(moved).all()):
-        return a
-    return a - J.T @ np.linalg.solve(inner, moved)
+    pull = kp * (q_des - q)
+    b[:] = pull - kd * v
+    if J is not None:
+        inner = J @ J.T + _RANK_REGULARISATION * np.eye(len(J))
+        moved = J @ pull
+        if np.isfinite(inner).all() and np.isfinite(moved).all():
+            b -= J.T @ np.linalg.solve(inner, moved)
