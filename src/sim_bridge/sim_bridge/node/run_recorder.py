@@ -22,7 +22,7 @@ from sim_bridge.mcap_file import McapFile
 from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES, RECORDED
 from sim_bridge.scenario.report import Array, RecordedRun
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
+from viability_bounds_pkg.ros.messages import Arrival, JointOrder, JointStateReader
 from viability_bounds_pkg.ros.runtime import LATCHED_QOS, stamp_to_ns
 from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
@@ -102,8 +102,9 @@ class RunRecorder:
         self._joints = tuple(joints)
         self._reader = JointStateReader(joints, needs_velocities=False, continuous=continuous)
         self._states: dict[int, tuple[Array, Array]] = {}
-        self._limits: dict[int, list[Sequence[float]]] = {}
-        self._torques: dict[int, Sequence[float]] = {}
+        self._order_of_limits, self._order_of_commands = JointOrder(joints), JointOrder(joints)
+        self._limits: dict[int, list[Array]] = {}
+        self._torques: dict[int, Array] = {}
         self._wrenches: dict[int, Sequence[float]] = {}
         self._recorded = RECORDED.publisher(node)
         for topic, callback in (
@@ -169,7 +170,7 @@ class RunRecorder:
             v=states[:, 1],
             a_lower=limits[:, 0],
             a_upper=limits[:, 1],
-            tau=np.array([self._torques.get(s) or nan for s in stamps]),
+            tau=np.array([self._torques.get(s, nan) for s in stamps]),
             ft_wrench=np.array([self._wrenches.get(s, [np.nan] * 6) for s in stamps]),
             answered=np.array([s in self._torques for s in stamps]),
         )
@@ -185,12 +186,16 @@ class RunRecorder:
             self._recorded.publish(message.header)
 
     def _on_limits(self, message: JointTrajectory) -> None:
-        limits = [point.accelerations for point in message.points]
-        self._limits[stamp_to_ns(message.header.stamp)] = limits
+        parts = [point.accelerations for point in message.points]
+        limits = _by_joint(self._order_of_limits, message.joint_names, parts)
+        if len(limits) == 2:
+            self._limits[stamp_to_ns(message.header.stamp)] = limits
 
     def _on_command(self, message: JointState) -> None:
         self.answered = stamp_to_ns(message.header.stamp)
-        self._torques.setdefault(self.answered, message.effort)
+        unknown = np.full(len(self._joints), np.nan)  # as of the drives' position control
+        found = _by_joint(self._order_of_commands, message.name, [message.effort])
+        self._torques.setdefault(self.answered, found[0] if found else unknown)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         f, t = message.wrench.force, message.wrench.torque
@@ -201,3 +206,12 @@ class RunRecorder:
             if sender := self._senders.get(status.name):
                 values = {value.key: value.value for value in status.values}
                 self.diagnostics[sender] = values
+
+
+def _by_joint(
+    order: JointOrder, names: Sequence[str], parts: Sequence[Sequence[float]]
+) -> list[Array]:
+    """Return numbers of a message in the order of the joints; none if it lacks any."""
+    if any(len(part) != len(names) for part in parts) or order.find(names)[0]:
+        return []
+    return [np.array(part)[order.index] for part in parts]

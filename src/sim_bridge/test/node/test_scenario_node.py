@@ -11,7 +11,12 @@ from std_msgs.msg import Header
 from sim_bridge.node import scenario_node
 from viability_bounds_pkg.ros.runtime import NEWEST_QOS
 from viability_bounds_pkg.testing.executables import as_child, called
-from viability_bounds_pkg.testing.ros_harness import config_folder, joint_state, read_config
+from viability_bounds_pkg.testing.ros_harness import (
+    acceleration_limits,
+    config_folder,
+    joint_state,
+    read_config,
+)
 
 DEADLINE = 60.0  # s
 
@@ -77,6 +82,24 @@ def test_a_recording_has_a_row_for_each_period_and_tells_the_robot_what_it_has(r
     np.testing.assert_allclose(run.t, 1e-9 * np.array([0, 10, 20, 30, 40]))
     np.testing.assert_array_equal(run.q[:, 0], [10, 20, np.nan, 40, np.nan])
     assert run.lost == 5  # there are no limits either
+
+
+def test_limits_and_torques_are_recorded_by_the_names_of_their_joints(ros, tmp_path):
+    """Also where a message lacks some, as of another robot."""
+    arguments(tmp_path)
+    values = read_config("panda", "scenario_node") | {"scenario": str(tmp_path / "scenario.yaml")}
+    recorder = ros.start(scenario_node.ScenarioNode, values).recorder
+    names, numbers = values["joints"], np.arange(7.0)
+    for stamp, joints in ((10, names), (20, names[::-1]), (30, names[:3])):
+        given = numbers[: len(joints)] if joints[0] == names[0] else numbers[::-1]
+        recorder._on_limits(acceleration_limits(joints, stamp, -given, given))
+        recorder._on_command(joint_state(joints, stamp, tau=given))
+    recorder._on_command(joint_state(names, 40, q=numbers))  # the drives' position control
+    run = recorder.run(10, period=10, periods=4)
+    rows = np.array([numbers, numbers, [np.nan] * 7, [np.nan] * 7])
+    for found, wanted in ((run.a_lower, -rows), (run.a_upper, rows), (run.tau, rows)):
+        np.testing.assert_array_equal(found, wanted)
+    assert run.answered.all()
 
 
 def test_angles_that_a_driver_wraps_do_not_leap_in_figures(ros, tmp_path):
