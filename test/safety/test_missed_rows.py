@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of missed deadlines while the integral action adds torque that the bounds do not know."""
+"""Rows of missed deadlines: torques drift that are held, and the integral action adds to them."""
 
 from contextlib import closing
 
@@ -55,3 +55,32 @@ def test_limits_are_kept(mode, seed):
     position, speed, missing = play(mode, seed)
     assert missing > 200
     assert position == 0.0 and speed == 0.0
+
+
+@pytest.mark.parametrize(
+    ("robot", "longest", "seed"),
+    [("panda", 2, 2), ("panda", 4, 0), ("baxter_left_arm", 2, 0)],
+)
+def test_a_torque_that_is_held_drifts_past_no_limit(robot, longest, seed):
+    """A third of the commands are missing, and the robot holds the last one."""
+    rng = np.random.default_rng(seed)
+    loop = DirectLoop(robot, HASTE | {"missed_deadlines": longest})
+    low, high = loop.config.position_min, loop.config.position_max
+    row = missing = unanswered = 0
+    periods = round(4.0 / loop.dt)
+    with closing(loop.robot) as arm:
+        for k in range(periods):
+            if k % round(1.0 / loop.dt) == 0:
+                loop.controller.goals.set_posture(posture_at_limits(rng, low, high))
+            if k and not unanswered and rng.random() < 0.4:
+                row = int(rng.integers(1, longest + 1))
+            if row:
+                row, missing, unanswered = row - 1, missing + 1, unanswered + 1
+            else:
+                q, v, _ = arm.state()
+                bounds = AccelerationRange(*loop.bounds(q, v)[:2])
+                elapsed, unanswered = (1 + unanswered) * loop.dt, 0
+                tau = loop.controller.step(State(q, v), bounds, None, elapsed).tau
+            arm.step(tau, loop.config.substeps)
+        assert missing > 0.3 * periods
+        assert not arm.monitor.violated

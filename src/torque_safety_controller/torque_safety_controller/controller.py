@@ -233,7 +233,9 @@ class Controller:
         plan = step.fallback - d
         widened = AccelerationRange(np.minimum(bounds.lower, plan), np.maximum(bounds.upper, plan))
         if rows is not None:
-            rows = rows._replace(upper=np.maximum(rows.upper, rows.G @ plan))
+            there = rows.G @ plan
+            lower = np.where(np.isfinite(rows.upper), np.minimum(rows.lower, there), rows.lower)
+            rows = rows._replace(lower=lower, upper=np.maximum(rows.upper, there))
         return solve(widened, rows)
 
     def _command(self, step: Step) -> None:

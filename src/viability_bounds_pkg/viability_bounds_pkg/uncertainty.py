@@ -67,6 +67,11 @@ class DeclaredUncertainty:
     )
 
     @property
+    def periods_held(self) -> int:
+        """Longest time for which a command may act, in control periods."""
+        return 1 + self.delay_jitter + self.missed_deadlines
+
+    @property
     def motor_lag(self) -> Array:
         """Time constant of the motors' torque, shape (n,), s; 0 without a lag."""
         bandwidth = 2.0 * np.pi * self.motor_bandwidth
@@ -131,8 +136,8 @@ def uncertainty_margins(
         fastest = np.maximum(-limits.a_min, limits.a_max) + acceleration_error
         velocity = errors.v + fastest * (late + lag) + spread * later
         position = errors.q + limits.v_max * (late + lag) + 0.5 * spread * later**2
-    longest = 1 + declared.delay_jitter + declared.missed_deadlines
-    return UncertaintyMargins(longest * dt, position, velocity, longest * dt)
+    held = declared.periods_held * dt
+    return UncertaintyMargins(held, position, velocity, held)
 
 
 def wrong_periods(declared: DeclaredUncertainty) -> int:
@@ -182,10 +187,11 @@ class Loop(NamedTuple):
             JointLimitsError: there are none.
         """
         horizon, position_error, velocity_error, held = self.margins(declared)
+        margins = self.torque_margins.held(declared.periods_held)
         return BoundsSolver(
-            tightened(self.limits, self.torque_margins),
+            tightened(self.limits, margins),
             horizon,
-            self.torque_margins.acceleration + declared.acceleration_disturbance,
+            margins.acceleration + declared.acceleration_disturbance,
             held,
             position_error=position_error,
             velocity_error=velocity_error,

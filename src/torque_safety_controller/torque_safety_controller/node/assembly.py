@@ -20,6 +20,7 @@ from torque_safety_controller.parts.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.disturbance import Disturbance
 from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.held_torque import HeldTorque
 from torque_safety_controller.parts.integral import Integral, make_integral
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.parts.slow_down import SlowDown
@@ -135,10 +136,17 @@ def make_parts(
         _safety_filter(config, robot.model),
         # A slowed arm is slowed inside of what the filter allows.
         SlowDown(config.position_min, config.position_max, config.dt),
+        # These bounds are for rows of missed deadlines, too.
+        _held_torque(robot, declared),
         # It counts on no more braking than the bounds leave.
         make_collision(config, robot.model),
     ]
     return [part for part in parts if part is not None]
+
+
+def _held_torque(robot: RobotModel, declared: BoundsConfiguration | None) -> HeldTorque | None:
+    periods = 1 if declared is None else declared.declared.periods_held
+    return HeldTorque(robot.model, periods * robot.dt, robot.dt) if periods > 1 else None
 
 
 def _safety_filter(config: ControllerConfiguration, model: pin.Model) -> SafetyFilter | None:

@@ -76,7 +76,7 @@ def test_rows_of_missed_deadlines_and_late_commands_lengthen_the_horizon():
     [
         ({"velocity_error": [0.1] * 6 + [1.2]}, "velocity_error", "panda_joint7"),
         ({"position_error": [0.1] * 3 + [2.0] * 4}, "position_error", "panda_joint4"),
-        ({"missed_deadlines": 90, "velocity_error": [0.8] * 7}, "velocity_error", "panda_joint1"),
+        ({"missed_deadlines": 20, "velocity_error": [0.8] * 7}, "velocity_error", "panda_joint1"),
         ({"delay": 90, "missed_deadlines": 1, **ESTIMATED}, "delay", "panda_joint1"),
         ({"delay_jitter": 40}, "delay_jitter", "panda_joint1"),
         ({"motor_bandwidth": [50.0] * 2 + [1.0] * 5}, "motor_bandwidth", "panda_joint3"),

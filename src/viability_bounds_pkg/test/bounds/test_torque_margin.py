@@ -60,3 +60,61 @@ def test_without_the_position_margin_the_limits_break():
     margins = torque_margins(jerk, dt)
     margins.position[:] = 0.0
     assert excess_in_units_of_d(rng, limits, dt, jerk, margins, 1.0)[0] > 1.0
+
+
+def excess_of_held_torques(rng, limits, dt, jerk, held, rule):
+    """The furthest, in rad and rad/s, that any joint goes beyond a limit while commands are lost.
+
+    The adversary chooses the drift, as far as some acceleration leaves both means within the
+    bounds, the error of the mean acceleration, and for how many periods a torque is held.
+
+    Args:
+        rule: whether the mean of the longest time is kept in the bounds, too.
+    """
+    margins = torque_margins(jerk, dt).held(held)
+    solver = BoundsSolver(tightened(limits, margins), held * dt, margins.acceleration)
+    later = 0.5 * (held - 1) * dt
+    q, v = np.zeros(JOINTS), np.zeros(JOINTS)
+    target = rng.choice([-1.0, 1.0], JOINTS)
+    position = speed = -np.inf
+    for _ in range(400):
+        lower, upper, _ = solver.bounds(q, v)
+        target *= np.where(rng.random(JOINTS) < 0.01, -1.0, 1.0)
+        width = (upper - lower) / later
+        drift = np.where(rng.random(JOINTS) < 0.8, target, rng.choice([-1.0, 0.0, 1.0], JOINTS))
+        drift = np.clip(jerk * drift, -width, width)
+        shift = later * drift if rule else np.zeros(JOINTS)
+        a = np.where(target > 0.0, upper - np.maximum(shift, 0.0), lower - np.minimum(shift, 0.0))
+        error = jerk / 36.0 * np.where(rng.random(JOINTS) < 0.8, target, -target)
+        end = dt * rng.choice([1, held, rng.integers(1, held + 1)], JOINTS)
+        for t in np.linspace(0.0, end, 6 * held + 1)[1:]:
+            v_t = v + t * a + t * (t - dt) / 2.0 * drift + t**2 * error
+            q_t = (
+                q
+                + t * v
+                + t**2 / 2.0 * a
+                + t**2 * (t / 6.0 - dt / 4.0) * drift
+                + t**3 / 3.0 * error
+            )
+            position = max(position, np.maximum(q_t - limits.q_max, limits.q_min - q_t).max())
+            speed = max(speed, (np.abs(v_t) - limits.v_max).max())
+        q, v = q_t, v_t
+    return position, speed
+
+
+@pytest.mark.parametrize(("seed", "held"), [(0, 2), (1, 3), (2, 9)])
+def test_torques_that_are_held_for_several_periods_keep_the_limits(seed, held):
+    rng = np.random.default_rng(seed)
+    limits, dt, jerk = random_case(rng)
+    jerk *= 2.0 / (1.0 + held)
+    position, speed = excess_of_held_torques(rng, limits, dt, jerk, held, rule=True)
+    assert position <= 1e-12 and speed <= 1e-12
+
+
+@pytest.mark.parametrize(("seed", "held"), [(0, 3), (1, 5)])
+def test_without_bounds_of_their_mean_acceleration_they_do_not(seed, held):
+    rng = np.random.default_rng(seed)
+    limits, dt, jerk = random_case(rng)
+    jerk *= 2.0 / (1.0 + held)
+    position, speed = excess_of_held_torques(rng, limits, dt, jerk, held, rule=False)
+    assert position > 1e-3 and speed > 1e-2

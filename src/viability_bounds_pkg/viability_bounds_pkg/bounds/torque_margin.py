@@ -30,6 +30,14 @@ class TorqueMargins(NamedTuple):
     velocity: NDArray[np.float64]
     position: NDArray[np.float64]
 
+    def held(self, periods: int) -> TorqueMargins:
+        """Return the margins where a torque is held for up to so many periods.
+
+        The controller lets the mean acceleration over all of them obey the bounds, too. What is
+        left of its error is at most as many times that of one period: J T / 36.
+        """
+        return self._replace(acceleration=0.5 * (1 + periods) * self.acceleration)
+
 
 def torque_margins(jerk: ArrayLike, dt: float) -> TorqueMargins:
     """Return the margins that make up for the change of acceleration within a step.

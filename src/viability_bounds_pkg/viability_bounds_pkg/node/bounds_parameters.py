@@ -118,7 +118,7 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
     @property
     def margins(self) -> TorqueMargins:
         """What the exact bounds keep back from the limits."""
-        margins = self.loop.torque_margins
+        margins = self.loop.torque_margins.held(self.declared.periods_held)
         disturbed = margins.acceleration + self.declared.acceleration_disturbance
         return margins._replace(acceleration=disturbed)
 
