@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator
@@ -50,7 +51,7 @@ def finite_vector(
         ValueError: it is not.
     """
     array = np.asarray(value, dtype=float)
-    if array.shape != (size,) or not np.isfinite(array).all():
+    if array.shape != (size,) or not all(map(math.isfinite, array.tolist())):
         raise ValueError(f"{name} must be {size} finite numbers, not {value!r}")
     if not signed and np.any(array < 0.0):
         raise ValueError(f"{name} must not be negative: {array}")

@@ -139,7 +139,7 @@ class BulletNode(ArmNode):
         RESET.serve(self, self._on_reset)
         PAUSE.serve(self, self._on_pause)
         if not config.lockstep:
-            steady_timer(self, config.dt, self._tick)
+            steady_timer(self, config.dt, lambda: self._state_publisher.in_turn(self._tick))
         steady_timer(self, RETRY_PERIOD, self._retry)
         if self._clock_publisher is not None:
             self.publisher_watch.add(self._clock_publisher.topic_name)

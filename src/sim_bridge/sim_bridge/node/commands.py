@@ -125,9 +125,10 @@ class CommandStream:
         command = self._reader.read(message)
         if isinstance(command, TorqueCommand):
             tau, tau_max = command.tau, self._config.torque_max
-            self.torque_ratio = max(self.torque_ratio, float(np.max(np.abs(tau) / tau_max)))
-            # The motors do not exceed their limits, whatever the command.
-            command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
+            ratio = max((np.abs(tau) / tau_max).tolist())
+            self.torque_ratio = max(self.torque_ratio, ratio)
+            if ratio > 1.0:  # the motors do not exceed their limits, whatever the command
+                command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
         return command
 
     def _count_stray(self, own: int, stamp: int) -> None:

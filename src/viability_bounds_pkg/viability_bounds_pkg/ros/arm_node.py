@@ -186,6 +186,7 @@ def connect(nodes: Sequence[ArmNode]) -> None:
             sources[stream.topic_name] = stream
     for node in nodes:
         for each in node.inputs:
+            each.queue = queue
             source = sources.setdefault(each.topic_name, each)
             if source is not each:
                 source.listeners += each.listeners

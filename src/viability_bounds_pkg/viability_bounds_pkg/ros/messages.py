@@ -327,7 +327,7 @@ class CommandReader:
             reason, detail = self._order.find(message.name)
         if not reason:
             arrays = [np.array(values)[self._order.index] for values in fields]
-            if all(np.isfinite(each).all() for each in arrays):
+            if all(math.isfinite(number) for each in arrays for number in each.tolist()):
                 return TorqueCommand(*arrays) if len(message.effort) else PositionCommand(*arrays)
             reason = "not finite"
         count_refusal("joint_commands", reason, detail, self._refused, self._warn)

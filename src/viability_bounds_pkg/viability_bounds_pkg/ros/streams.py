@@ -51,6 +51,13 @@ class Stream:
         else:
             self._publisher.publish(message)
 
+    def in_turn(self, act: Callable[[], None]) -> None:
+        """Do in a callback of the executor what may publish; see `Queue.in_turn`."""
+        if self.queue is None:
+            act()
+        else:
+            self.queue.in_turn(act)
+
     def publish_outside(self, message: Any) -> None:
         """Send a message to other processes, if any of them subscribes."""
         if self.subscribers:
@@ -71,6 +78,7 @@ class Input:
     Attributes:
         listeners: the callback, and those of other nodes of the process that share the
             subscription.
+        queue: takes what they publish to listeners in the process; None while there are none.
         topic_name: of the topic, resolved.
     """
 
@@ -84,6 +92,7 @@ class Input:
         of_other: Callable[[Any], bool] = lambda _: False,
     ) -> None:
         self.listeners = [callback]
+        self.queue: Queue | None = None
         self._node, self._watch, self._of_other = node, watch, of_other
         self._subscription = node.create_subscription(
             topic.message, topic.name, self._receive, qos or topic.qos
@@ -91,9 +100,16 @@ class Input:
         self.topic_name: str = self._subscription.topic_name
 
     def _receive(self, message: Any) -> None:
-        if self._watch.admits(self.topic_name, self._of_other(message)):
-            for listener in self.listeners:
-                listener(message)
+        if not self._watch.admits(self.topic_name, self._of_other(message)):
+            return
+        if self.queue is None:
+            self._hand_on(message)
+        else:
+            self.queue.in_turn(lambda: self._hand_on(message))
+
+    def _hand_on(self, message: Any) -> None:
+        for listener in self.listeners:
+            listener(message)
 
     def unsubscribe(self) -> None:
         """Get no messages from ROS any more."""
@@ -122,6 +138,15 @@ class Queue:
         self._messages.pop(stream, None)
         self._messages[stream] = message
         self._schedule()
+
+    def in_turn(self, act: Callable[[], None]) -> None:
+        """Do in a callback of the executor what may publish, and deliver it in the same turn."""
+        if self._scheduled:  # it is delivered with what waits
+            act()
+            return
+        self._scheduled = True
+        act()
+        self._deliver()
 
     def _schedule(self) -> None:
         if self._scheduled or not self._messages:
