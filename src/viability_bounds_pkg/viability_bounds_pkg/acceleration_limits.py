@@ -26,6 +26,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from viability_bounds_pkg.estimate.torque_terms import Bodies
 from viability_bounds_pkg.estimate.worst_case import (
     Array,
     LimitEstimateError,
@@ -259,7 +260,7 @@ def largest_velocity_scale(
         if found.scale == 0.0 or not lacking.any():
             break
         q = worst.q.reshape(-1, n)
-        at_rest = acceleration_room(model, model.createData(), space, q, np.zeros_like(q))
+        at_rest = acceleration_room(model, Bodies.of(model), space, q, np.zeros_like(q))
         at_rest = np.einsum("sjsj->sj", at_rest.reshape(2, n, 2, n))  # of the joint and the side
         spare = np.maximum(at_rest - required, 0.0)
         square = np.divide(
@@ -308,4 +309,4 @@ def limits_in_share(model: pin.Model, space: StateSpace, share: float) -> Array:
 def _random_room(model: pin.Model, space: StateSpace) -> Array:
     """Return how far accelerations can go up and down in random states, shape (k, 2, n)."""
     q, v = space.states(np.random.default_rng(0).random((20_000, 2 * space.n)))
-    return acceleration_room(model, model.createData(), space, q, v)
+    return acceleration_room(model, Bodies.of(model), space, q, v)

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +18,13 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
+from viability_bounds_pkg.estimate.torque_terms import Bodies, torque_terms
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
 
-CHUNK = 10_000
-"""States evaluated at once."""
+CHUNK = 1000
+"""States evaluated at once, by one thread."""
 
 NO_INERTIA = 1e-10
 """Below this diagonal entry of M (kg m^2 or kg) a joint is taken to move nothing."""
@@ -150,27 +153,8 @@ class WorstCases:
         self.v[better] = v[row[better]]
 
 
-def torque_terms(model: pin.Model, data: pin.Data, q: Array, v: Array) -> tuple[Array, Array]:
-    """Return the bias forces and the diagonal of the inertia matrix of a batch of states.
-
-    Args:
-        model: the robot.
-        data: of `model`.
-        q: positions, shape (batch, n), rad.
-        v: velocities, shape (batch, n), rad/s.
-
-    Returns:
-        h, shape (batch, n), N m, and the diagonal of M, rotors included, shape (batch, n), kg m^2.
-    """
-    h, inertia = np.empty(q.shape), np.empty(q.shape)
-    for i in range(len(q)):
-        inertia[i] = pin.crba(model, data, q[i]).diagonal()
-        h[i] = pin.nonLinearEffects(model, data, q[i], v[i])
-    return h, inertia
-
-
 def acceleration_room(
-    model: pin.Model, data: pin.Data, space: StateSpace, q: Array, v: Array
+    model: pin.Model, bodies: Bodies, space: StateSpace, q: Array, v: Array
 ) -> Array:
     """Return how far each joint can accelerate up and down with the others at constant speed.
 
@@ -181,7 +165,7 @@ def acceleration_room(
     Raises:
         LimitEstimateError: a joint that moves no inertia.
     """
-    h, inertia = torque_terms(model, data, q, v)
+    h, inertia = torque_terms(bodies, q, v)
     if inertia.min() < NO_INERTIA:
         joint = model.names[1 + int(np.argmin(inertia.min(axis=0)))]
         raise LimitEstimateError(
@@ -206,12 +190,20 @@ def search_by_sampling(model: pin.Model, space: StateSpace, samples: int, seed: 
         LimitEstimateError: fewer than one sample, or a joint that moves no inertia.
     """
     _require_samples(samples)
-    rng = np.random.default_rng(seed)
-    data = model.createData()
+    bodies = Bodies.of(model)
+
+    def evaluate(first: int) -> tuple[Array, Array, Array]:
+        """Return rooms and states of a chunk, whose place in the sequence is its own."""
+        generator = np.random.PCG64(seed)
+        generator.advance(2 * space.n * first)
+        count = min(CHUNK, samples - first)
+        q, v = space.states(np.random.Generator(generator).random((count, 2 * space.n)))
+        return acceleration_room(model, bodies, space, q, v), q, v
+
     worst = WorstCases(space.n)
-    for done in range(0, samples, CHUNK):
-        q, v = space.states(rng.random((min(CHUNK, samples - done), 2 * space.n)))
-        worst.update(acceleration_room(model, data, space, q, v), q, v)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for found in pool.map(evaluate, range(0, samples, CHUNK)):
+            worst.update(*found)
     return worst
 
 
@@ -233,19 +225,21 @@ def search_refined(model: pin.Model, space: StateSpace, evaluations: int, seed: 
     """
     _require_samples(evaluations)
     n = space.n
-    data = model.createData()
+    data, bodies = model.createData(), Bodies.of(model)
     worst = WorstCases(n)
     count = max(int(SAMPLED_SHARE * evaluations), 1)
     unit = np.random.default_rng(seed).random((count, 2 * n))
     unit[1::2, n:] = np.round(unit[1::2, n:])
     q, v = space.states(unit)
-    room = acceleration_room(model, data, space, q, v)
+    room = acceleration_room(model, bodies, space, q, v)
     worst.update(room, q, v)
     idle = 0
     for starts in np.argsort(room.reshape(count, 2 * n), axis=0, kind="stable"):
         before = worst.room.copy()
         for limit, start in enumerate(starts):
-            _descend(model, data, space, worst, unit[start], *divmod(limit, n), evaluations)
+            _descend(
+                model, data, bodies, space, worst, unit[start], *divmod(limit, n), evaluations
+            )
         idle = 0 if np.any(worst.room < before - 1e-6 * np.abs(before)) else idle + 1
         if worst.evaluations + 2 > evaluations or idle == PATIENCE:
             break
@@ -259,6 +253,7 @@ class _Spent(Exception):
 def _descend(
     model: pin.Model,
     data: pin.Data,
+    bodies: Bodies,
     space: StateSpace,
     worst: WorstCases,
     start: Array,
@@ -277,7 +272,7 @@ def _descend(
         if worst.evaluations + 2 > evaluations:
             raise _Spent
         q, v = space.states(unit[None])
-        rooms = acceleration_room(model, data, space, q, v)
+        rooms = acceleration_room(model, bodies, space, q, v)
         worst.update(rooms, q, v)
         worst.evaluations += 1
         room = float(rooms[0, side, joint])
