@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +24,6 @@ HEADS = (
     "acceleration limits, rad/s²",
     "safety filter",
     "limits in the scenario",
-    "time to files, s",
     "exact robot",
     "imperfect robot",
 )
@@ -99,19 +97,12 @@ def play(name: str, arm: Arm) -> Row:
     command = ["bash", str(ROOT / "scripts" / "new_robot.sh"), urdf_of(arm), arm.tip]
     command += ["--name", name, "--out", str(config), "--force"]
     command += ["--base", arm.base] if arm.base else []
-    begin, seconds, lines = time.monotonic(), 0.0, []
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as run:
-        assert run.stdout is not None
-        for line in run.stdout:
-            lines.append(line.strip())
-            if line.startswith("written: ") and not seconds:
-                seconds = time.monotonic() - begin
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    lines = [line.strip() for line in done.stdout.splitlines()]
     (FOLDER / f"{name}.txt").write_text("\n".join(lines) + "\n")
-    if not seconds:
+    if not any(line.startswith("written: ") for line in lines):
         refusals = [line for line in lines if line.startswith("new_robot: ")]
-        why = (refusals or lines)[-1].removeprefix("new_robot: ")
+        why = "; ".join(line.removeprefix("new_robot: ") for line in refusals or lines[-1:])
         return (f"`{name}`", *[""] * (len(HEADS) - 3), why, "")
     values = yaml.safe_load((config / f"{name}.yaml").read_text())
     robot = values["/**"]["ros__parameters"]
@@ -129,7 +120,6 @@ def play(name: str, arm: Arm) -> Row:
         f"{low:g} to {max(robot['acceleration_max']):g}",
         "yes" if filtered else "-",
         reached.partition(" with ")[2].partition(" position")[0].replace(" of the ", " of "),
-        f"{seconds:.0f}",
         *(kept + ["-", "-"])[:2],
     )
 

@@ -42,11 +42,10 @@ from torque_safety_controller.new_robot.urdf import (
     without_comments,
 )
 from torque_safety_controller.tools.fit_capsules import with_capsules
+from torque_safety_controller.tools.gain_limits import HORIZON, OBSERVER
 from torque_safety_controller.tools.suitable_gains import (
     GAINS,
-    HORIZON,
     IMPERFECT_GAINS,
-    OBSERVER,
     OBSERVER_MAX,
     OBSERVER_PERIODS,
     Gains,
