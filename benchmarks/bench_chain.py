@@ -23,7 +23,6 @@ import rclpy
 from chain import load_node_values, load_values
 from geometry_msgs.msg import PoseStamped
 from live_robot import goals
-from rclpy.node import Node
 from relays import RelayCommand, RelayLimits
 from sensor_msgs.msg import JointState
 
@@ -34,7 +33,8 @@ from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.robot.description import build_model
 from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.ros.arm_node import ArmNode, connect
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor, set_stamp
+from viability_bounds_pkg.ros.program import prepared_executor
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES
 from viability_bounds_pkg.testing.ros_harness import overrides
 
@@ -91,11 +91,11 @@ def drive(executor: Any, probe: Probe, model: pin.Model, cycles: int) -> list[fl
     return times
 
 
-def make_chains(robot: str, imperfect: bool) -> tuple[dict[str, Probe], list[Node], pin.Model]:
+def make_chains(robot: str, imperfect: bool) -> tuple[dict[str, Probe], list[ArmNode], pin.Model]:
     """Return the probes by the names of their chains, all other nodes, and the arm's model."""
     values = load_values(robot)
     joints, urdf = values["joints"], read_urdf(values["robot_description"])
-    nodes: list[Node] = []
+    nodes: list[ArmNode] = []
     probes: dict[str, Probe] = {}
 
     def add(name: str, chain: list[Any], way: str, namespace: str) -> None:
@@ -106,10 +106,11 @@ def make_chains(robot: str, imperfect: bool) -> tuple[dict[str, Probe], list[Nod
             connect([probes[name], *chain])
         nodes.extend(chain)
 
-    def configured(kind: Any, namespace: str, own: dict[str, Any]) -> Node:
+    def configured(kind: Any, namespace: str, own: dict[str, Any]) -> ArmNode:
         own = own | {"bounds_timeout": 1.0, "rate_hz": 1e9 / DT_NS}
         given = overrides({name: value for name, value in own.items() if value != []})
-        return kind(namespace=namespace, parameter_overrides=given)
+        node: ArmNode = kind(namespace=namespace, parameter_overrides=given)
+        return node
 
     for way in WAYS:
         real, relay = (f"{kind}_{way.replace(' ', '_')}" for kind in ("real", "relay"))
@@ -138,10 +139,8 @@ def main() -> None:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     rclpy.init()
     probes, nodes, model = make_chains(options.robot, options.imperfect)
-    executor = make_executor()
-    running: list[Node] = [*nodes, *probes.values()]
-    for node in running:
-        executor.add_node(node)
+    running = [*nodes, *probes.values()]
+    executor = prepared_executor(running)
     for name, probe in probes.items():
         deadline = time.monotonic() + START
         while np.isnan(probe.cycle(executor)):

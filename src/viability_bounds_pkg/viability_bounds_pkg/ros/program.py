@@ -149,7 +149,7 @@ def run_together(
         for node in make_nodes():
             nodes.append(node)
         connect(nodes)
-        executor = _prepare(nodes)
+        executor = prepared_executor(nodes)
         if not told:
             spin(executor, nodes[0])
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -166,8 +166,8 @@ def run_together(
     return 0
 
 
-def _prepare(nodes: Sequence[ArmNode]) -> Executor:
-    """Return an executor with nodes."""
+def prepared_executor(nodes: Sequence[ArmNode]) -> Executor:
+    """Return an executor with nodes that are complete."""
     executor = make_executor()
     if EventsExecutor is None:
         nodes[0].get_logger().warning(
