@@ -11,29 +11,14 @@ import argparse
 import math
 import re
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from torque_safety_controller.new_robot.capsules import capsule_entries
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError, find_chain
 from torque_safety_controller.new_robot.estimates import Estimates, estimate
 from torque_safety_controller.new_robot.files import parameter_file, scenario_file
-from torque_safety_controller.new_robot.hardware import (
-    ERRORS,
-    QUICKEST,
-    ROOM,
-    Array,
-    Errors,
-    acceleration_errors,
-    imperfect_file,
-    with_rotors,
-)
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.new_robot.urdf import (
     shapes,
@@ -42,18 +27,17 @@ from torque_safety_controller.new_robot.urdf import (
     without_comments,
 )
 from torque_safety_controller.tools.fit_capsules import with_capsules
-from torque_safety_controller.tools.gain_limits import HORIZON, OBSERVER
+from torque_safety_controller.tools.gain_limits import OBSERVER
+from torque_safety_controller.tools.imperfect_robot import imperfect_text
 from torque_safety_controller.tools.suitable_gains import (
     GAINS,
-    IMPERFECT_GAINS,
     OBSERVER_MAX,
     OBSERVER_PERIODS,
     Gains,
     suitable_gains,
 )
-from viability_bounds_pkg.cli.command_line import Parser, number, positive, run_tool
+from viability_bounds_pkg.cli.command_line import Parser, number, positive, run_tool, stage
 from viability_bounds_pkg.cli.limits_file import check_writable, write_whole
-from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.robot.files import (
     parsed_urdf,
     resolve_uri,
@@ -165,10 +149,10 @@ def _run(options: argparse.Namespace) -> int:
         there = next(folder for folder in path.resolve().parents if folder.exists())
         check_writable(there / path.name)
     _tell_chain(chain)
-    with _stage("estimating acceleration limits"):
+    with stage("estimating acceleration limits"):
         estimates = estimate(chain, options.rate)
     _tell_estimates(chain, estimates)
-    with _stage("looking for postures"):
+    with stage("looking for postures"):
         geometry, trouble = shapes(urdf, folder, chain.model)
         touches = SelfCollisions(chain, geometry)
         postures = find_postures(chain, touches)
@@ -189,10 +173,10 @@ def _run(options: argparse.Namespace) -> int:
         )  # fmt: skip
 
     observer = min(OBSERVER_PERIODS / estimates.rate_hz, OBSERVER_MAX)
-    with _stage("checking gains"):
+    with stage("checking gains"):
         gains = suitable_gains(urdf, lambda *of: [robot_text(*of)], GAINS | {OBSERVER: observer})
     text = robot_text(gains, source)
-    with _stage("fitting capsules"):
+    with stage("fitting capsules"):
         if capsules := capsule_entries(chain.model, geometry):
             text = with_capsules(text, capsules)
     texts = {
@@ -201,9 +185,9 @@ def _run(options: argparse.Namespace) -> int:
         "urdf": urdf,
     }
     if not options.ideal:
-        with _stage("making an imperfect robot"):
+        with stage("making an imperfect robot"):
             try:
-                texts["imperfect"] = _imperfect(chain, estimates, gains, urdf, robot_text)
+                texts["imperfect"] = imperfect_text(chain, estimates, gains, urdf, robot_text)
             except NewRobotError as error:
                 print(error)
                 del files["imperfect"]
@@ -213,81 +197,6 @@ def _run(options: argparse.Namespace) -> int:
     for name, path in files.items():
         print(f"written: {path} ({name})")
     return 0
-
-
-def _imperfect(
-    chain: Chain,
-    exact: Estimates,
-    gains: Gains,
-    urdf: str,
-    exact_text: Callable[[Gains, str], str],
-) -> str:
-    """Return the file of an imperfect robot, with the largest errors that leave bounds.
-
-    Args:
-        chain: the arm.
-        exact: its limits without rotors and errors.
-        gains: in its own file.
-        urdf: text of its URDF.
-        exact_text: returns its own file, with gains and the place of the URDF.
-
-    Raises:
-        NewRobotError: no errors leave bounds.
-    """
-    real = with_rotors(chain, exact.v_max)
-    estimates = estimate(real, exact.rate_hz)
-    quickest = QUICKEST * estimates.v_max
-    estimates = replace(
-        estimates,
-        a_min=np.maximum(estimates.a_min, -quickest),
-        a_max=np.minimum(estimates.a_max, quickest),
-    )
-    reason = "they take too much of the acceleration limits"
-    for errors in ERRORS:
-        disturbance = acceleration_errors(real, estimates, errors)
-        if (disturbance > ROOM * np.minimum(-estimates.a_min, estimates.a_max)).any():
-            continue
-
-        def texts(
-            own: Gains, place: str, errors: Errors = errors, disturbance: Array = disturbance
-        ) -> list[str]:
-            changed = {name: value for name, value in own.items() if gains.get(name) != value}
-            imperfect = imperfect_file(real, estimates, errors, disturbance, changed)
-            return [exact_text(gains, place), imperfect]
-
-        try:
-            begin = {**gains, **IMPERFECT_GAINS, HORIZON: errors.horizon}
-            return texts(suitable_gains(urdf, texts, begin), "")[1]
-        except ArmSafetyError as error:  # they leave no bounds, or no gains suit
-            reason = str(error)
-    raise NewRobotError(
-        f"no imperfect robot at {exact.rate_hz:g} Hz: with the least errors {reason}; a higher "
-        "--rate, or a file of your own like those in config/imperfect"
-    )
-
-
-@contextmanager
-def _stage(name: str) -> Iterator[None]:
-    """Tell on stderr what is done, on a terminal with its seconds."""
-    done, begin = threading.Event(), time.monotonic()
-
-    def tell() -> None:
-        while not done.wait(1.0):
-            seconds = time.monotonic() - begin
-            print(f"\r{name}: {seconds:.0f} s", end="", file=sys.stderr, flush=True)
-
-    if not sys.stderr.isatty():
-        print(f"{name} ...", file=sys.stderr, flush=True)
-        yield
-        return
-    thread = threading.Thread(target=tell, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
-        print("\r\033[K", end="", file=sys.stderr, flush=True)
 
 
 def _tell_chain(chain: Chain) -> None:

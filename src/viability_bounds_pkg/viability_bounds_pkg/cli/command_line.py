@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared by command line tools: errors and interrupts in one line, exit codes."""
+"""Shared by command line tools: errors and interrupts in one line, exit codes, progress."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -74,3 +77,27 @@ def run_tool(name: str, tool: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print(f"{name}: interrupted, nothing written", file=sys.stderr)
         return INTERRUPTED
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Tell on stderr what is done, on a terminal with its seconds."""
+    done, begin = threading.Event(), time.monotonic()
+
+    def tell() -> None:
+        while not done.wait(1.0):
+            seconds = time.monotonic() - begin
+            print(f"\r{name}: {seconds:.0f} s", end="", file=sys.stderr, flush=True)
+
+    if not sys.stderr.isatty():
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        yield
+        return
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+        print("\r\033[K", end="", file=sys.stderr, flush=True)
