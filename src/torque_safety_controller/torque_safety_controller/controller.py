@@ -207,7 +207,7 @@ class Controller:
             NoSolutionFound: numbers that are not finite or absurd, or no task with a weight.
         """
         robot, d = self.robot, step.disturbance
-        low, high = self._limiter.range() - (robot.h + step.torque)
+        bounds, low, high = step.limits_of_qp(self._limiter.range())
         terms = [task.term(robot) for task in step.tasks]
         rows = stack_constraints(
             [
@@ -220,7 +220,6 @@ class Controller:
             qp = self._qp
             return qp.solve(qp.build(terms, bounds, robot.M, low, high, rows, step.forces))
 
-        bounds = step.commanded(step.bounds)
         if step.eased is not None:
             solution = solve(step.eased, rows)
             if solution.exact:

@@ -15,6 +15,7 @@ from viability_bounds_pkg.robot.payload import Payload
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
+_LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class FrameModel:
@@ -42,15 +43,14 @@ class FrameModel:
 
     def read(self, model: pin.Model, data: pin.Data) -> None:
         """Take pose, Jacobian and drift from `data`, which has the kinematics of the state."""
-        frame, local = self._frame_id, pin.ReferenceFrame.LOCAL
+        frame = self._frame_id
         self.pose = pin.updateFramePlacement(model, data, frame)
-        self.J = pin.getFrameJacobian(model, data, frame, local)
-        self.drift = pin.getFrameAcceleration(model, data, frame, local).vector
+        self.J = pin.getFrameJacobian(model, data, frame, _LOCAL)
+        self.drift = pin.getFrameAcceleration(model, data, frame, _LOCAL).vector
 
     def read_rate(self, model: pin.Model, data: pin.Data) -> None:
         """Take the time derivative of the Jacobian from `data`."""
-        local = pin.ReferenceFrame.LOCAL
-        self.J_dot = pin.getFrameJacobianTimeVariation(model, data, self._frame_id, local)
+        self.J_dot = pin.getFrameJacobianTimeVariation(model, data, self._frame_id, _LOCAL)
 
 
 class RobotModel(FrameModel):

@@ -117,9 +117,21 @@ class Step:
         For one upwards the upper bound is lowered, and else the lower one raised; if they cross,
         the other one follows.
         """
-        lower, upper = np.empty((2, self.robot.n))
+        lower, upper = np.empty(self.robot.n), np.empty(self.robot.n)
         _narrow(self.disturbance, bounds.lower, bounds.upper, lower, upper)
         return AccelerationRange(lower, upper)
+
+    def limits_of_qp(self, torque_limits: Array) -> tuple[AccelerationRange, Array, Array]:
+        """Return bounds of the commanded accelerations a, and lower and upper limits of M a.
+
+        Args:
+            torque_limits: lower and upper ones, shape (2, n), N m.
+        """
+        n, h, d = self.robot.n, self.robot.h, self.disturbance
+        low, high, tau_low, tau_high = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+        lower, upper = self.bounds
+        _write_limits(d, lower, upper, low, high, h, self.torque, torque_limits, tau_low, tau_high)
+        return AccelerationRange(low, high), tau_low, tau_high
 
     def relaxation_of(self, part: Part) -> Array | None:
         """Return by how much the QP relaxed the rows of a part, in their units; None for not."""
@@ -192,6 +204,26 @@ def _narrow(disturbance: Array, lower: Array, upper: Array, low: Array, high: Ar
         else:
             low[j] = lower[j] - e
             high[j] = max(low[j], upper[j])
+
+
+@njit(cache=True)
+def _write_limits(
+    disturbance: Array,
+    lower: Array,
+    upper: Array,
+    low: Array,
+    high: Array,
+    h: Array,
+    torque: Array,
+    limits: Array,
+    tau_low: Array,
+    tau_high: Array,
+) -> None:
+    """Write bounds of a, `low` and `high`, and limits of M a, see `Step.limits_of_qp`."""
+    _narrow(disturbance, lower, upper, low, high)
+    for j in range(h.size):
+        bias = h[j] + torque[j]
+        tau_low[j], tau_high[j] = limits[0, j] - bias, limits[1, j] - bias
 
 
 def joints_beyond(model: pin.Model, torque: Array, most: Array) -> str:

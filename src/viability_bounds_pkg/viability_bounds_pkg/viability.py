@@ -104,8 +104,8 @@ class BoundsSolver:
         """
         q = np.asarray(q, dtype=np.float64)
         v = np.asarray(v, dtype=np.float64)
-        n = len(self.limits)
-        if q.shape != v.shape or q.ndim not in (1, 2) or q.shape[-1] != n:
+        n, shape = len(self.table), q.shape
+        if v.shape != shape or len(shape) not in (1, 2) or shape[-1] != n:
             shapes = f"with q of shape {q.shape} and v of shape {v.shape}"
             allowed = f"both must have shape ({n},) or (batch, {n})"
             raise JointLimitsError("state", None, shapes, allowed)

@@ -214,10 +214,16 @@ class Goals(Part):
         Args:
             stiffness: factors of the pose task's gains, shape (6,); None for ones.
         """
-        made_of = self.targets, self.gains, self.posture, stiffness
+        targets, gains, posture, shares = self._made_of
         # Mostly nothing has changed since the last step.
-        if any(new is not old for new, old in zip(made_of, self._made_of, strict=True)):
-            self._made_of, self._tasks = made_of, self._make_tasks(stiffness)
+        if not (
+            targets is self.targets
+            and gains is self.gains
+            and posture is self.posture
+            and shares is stiffness
+        ):
+            self._made_of = self.targets, self.gains, self.posture, stiffness
+            self._tasks = self._make_tasks(stiffness)
         return self._tasks
 
     def _make_tasks(self, stiffness: Array | None) -> list[Task]:

@@ -35,6 +35,8 @@ from torque_safety_controller.qp.solvers import (
 
 Array = NDArray[np.float64]
 
+_NO_FORCES = np.zeros(0)
+
 _NEGLIGIBLE = 1e-6
 """Less relaxation than this, rad/s^2, is none."""
 
@@ -130,7 +132,7 @@ class InverseDynamicsQP:
             raise NoSolutionFound("no task with a weight above 0")
         size = n + r
         H, g, C = np.zeros((size, size)), np.zeros(size), np.zeros((n + k, size))
-        lower, upper = np.zeros((2, size + n + k))
+        lower, upper = np.zeros(size + n + k), np.zeros(size + n + k)
         # Mostly one task is of the joints: it is written at once.
         joints = [task for task in tasks if task.A is None]
         b, share = (joints[0].b, joints[0].weight / greatest) if joints else (tau_lower, 0.0)
@@ -138,9 +140,9 @@ class InverseDynamicsQP:
         for task in joints[1:]:
             H[range(n), range(n)] += task.weight / greatest
             g[:n] -= task.weight / greatest * task.b
-        for task in tasks:
-            if task.A is not None:
-                _add_least_squares(H, g, task.A, task.b, task.weight / greatest, 0)
+        for A, b, weight in tasks:
+            if A is not None:
+                _add_least_squares(H, g, A, b, weight / greatest, 0)
         if constraints is not None:
             C[n:, :n] = G
             lower[size + n :] = row_lower
@@ -178,7 +180,8 @@ class InverseDynamicsQP:
                 relaxation, constraint_relaxation = bounds, rows
         elif status is not Status.SOLVED:
             raise NoSolutionFound("not finite, absurd, or lower limits above upper ones", program)
-        return Solution(x[:n], x[n:], relaxation, constraint_relaxation, iterations)
+        a, rho = (x, _NO_FORCES) if len(x) == n else (x[:n], x[n:])
+        return Solution(a, rho, relaxation, constraint_relaxation, iterations)
 
     def _relaxed(self, program: QuadraticProgram) -> tuple[Array, int]:
         """Return the solution with bounds and constraints relaxed least, and the iterations."""
