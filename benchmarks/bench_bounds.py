@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time the acceleration bounds of 7 joints: calls of a control loop, and batches.
 
-Medians of blocks; where condition (11) holds and where it does not.
+Medians of blocks; where condition (11) holds and where it does not. If PyTorch is installed, the
+table of batches is written into docs/start/without_ros.md.
 """
 
 from __future__ import annotations
@@ -12,12 +13,15 @@ import time
 from functools import partial
 
 import numpy as np
+from figure import table, write_part
 
+from viability_bounds_pkg import batch
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver, acceleration_bounds
 
 JOINTS = 7
 BLOCKS, CALLS, BATCH = 60, 400, 100_000
+ARMS, TURNS = 4096, 30
 CASES = {"1 kHz": (-2.0, 2.0, 2.0, 12.0, 0.001), "too fast": (-0.5, 0.5, 0.6, 10.0, 0.1)}
 """q_min, q_max, v_max, a_max, dt; (11) fails in the second."""
 
@@ -78,12 +82,48 @@ def measure(name: str, case: Case, rng: np.random.Generator) -> None:
     print(f"  batch {1e-6 * rate:.1f} M joint-states/s, construction {1e3 * construction:.1f} ms")
 
 
+def measure_batches(rng: np.random.Generator) -> None:
+    """Time a batch of all arms on one core, by turns, and print and write the table."""
+    case = CASES["1 kHz"]
+    solver = BoundsSolver(limits_of(case), case[-1])
+    q, v = states_of(case, ARMS, rng)
+    calls = {
+        "compiled: `BoundsSolver.bounds`": partial(solver.bounds, q, v),
+        "NumPy: `batch.bounds`": partial(batch.bounds, solver, q, v),
+    }
+    try:
+        import torch
+
+        torch.set_num_threads(1)
+        tensors = torch.asarray(q), torch.asarray(v)
+        calls["PyTorch: `batch.bounds`"] = partial(batch.bounds, solver, *tensors)
+    except ModuleNotFoundError:
+        print("PyTorch is not installed: pip install torch")
+    times = np.empty((TURNS, len(calls)))
+    for turn in times:
+        for k, call in enumerate(calls.values()):
+            begin = time.thread_time()
+            call()
+            turn[k] = time.thread_time() - begin
+    medians = np.median(times, axis=0)
+    shares = np.median(times[:, :1] / times, axis=0)
+    rows = [
+        (name, f"{1e-6 * ARMS / median:.2g} million", f"{share:.2f}")
+        for name, median, share in zip(calls, medians, shares, strict=True)
+    ]
+    text = table(rows, (f"batches of {ARMS:,} arms", "states per second", "of the compiled ones"))
+    print(text)
+    if len(calls) == 3:
+        write_part("batches", text, "start/without_ros.md")
+
+
 def main() -> None:
     """Measure and print."""
     argparse.ArgumentParser(description=__doc__).parse_args()
     rng = np.random.default_rng(0)
     for name, case in CASES.items():
         measure(name, case, rng)
+    measure_batches(rng)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ setup(
     ],
     python_requires=">=3.10",
     install_requires=[
+        "array-api-compat>=1.10",
         "daqp>=0.7",
         "numba>=0.59",
         "numpy>=1.26",

@@ -19,6 +19,7 @@ SAYS = {
     "controller_without_ros": r"rad, .* rad/s, .* N m inside\njoints at rest on a limit: \['",
     "driver_that_stops": r"at rest after 0\.5\d\d s.*\nnearest to a limit: [34]\.\de-04 rad, \d",
     "mujoco_panda": r"largest speed 99\.\d% of its limit.*\n.*\n-\S+ rad, -\S+ rad/s, -",
+    "safe_policy": r"with the bounds 4096 of 4096 arms .*\nwithout them 0 of 4096, ",
     "limits_from_urdf": r"torque does not suffice: 0 of 5000",
 }
 
@@ -54,6 +55,8 @@ def test_the_notebook_runs_cell_by_cell(capfd, monkeypatch):
 )
 def test_example(name, capfd, monkeypatch):
     path = EXAMPLES / f"{name}.py"
+    if name == "safe_policy":
+        pytest.importorskip("torch", reason="PyTorch is not installed")
     if name in ("chain_of_nodes", "client"):  # they start ROS
         ended = subprocess.run([sys.executable, path], timeout=300, check=False)
         assert ended.returncode == 0
@@ -64,3 +67,10 @@ def test_example(name, capfd, monkeypatch):
         assert not end.value.code
     said = capfd.readouterr().out
     assert re.search(SAYS[name], said), said
+
+
+def test_the_policy_says_in_one_line_that_it_needs_pytorch(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(EXAMPLES / "safe_policy.py"), run_name="__main__")
+    assert end.value.code == "safe_policy.py needs PyTorch: pip install torch"

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The acceleration bounds of many states at once, on arrays of NumPy, PyTorch or JAX.
+
+For training policies in a simulation of thousands of arms: the bounds of `viability`, without a
+loop over states or joints, where the states are, a GPU included. The arrays must follow the Python
+array API standard, or be known to array-api-compat, which names differences of libraries.
+
+The equations are those of `bounds/kernel.py`, with a choice between values for each of its
+branches. `docs/theory/bounds.md` derives them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from array_api_compat import array_namespace, device
+
+from viability_bounds_pkg.bounds.kernel import AccelerationBounds
+from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError
+from viability_bounds_pkg.viability import BoundsSolver
+
+Array = Any
+"""An array of any of these libraries."""
+
+
+def acceleration_bounds(
+    q: Array, v: Array, limits: JointLimits, dt: float, **options: Any
+) -> AccelerationBounds:
+    """Return the acceleration bounds of states of any shape (..., n).
+
+    A function for `bounds(BoundsSolver(limits, dt, **options), q, v)`. In a loop, make the solver
+    once, as it checks limits and margins.
+
+    Args:
+        q: shape (..., n), rad.
+        v: same shape, type and device, rad/s.
+        limits: of n joints.
+        dt: step, s.
+        **options: `margin`, `period`, `position_error` and `velocity_error` of `BoundsSolver`.
+
+    Raises:
+        JointLimitsError: an argument is unusable, or the shapes do not fit.
+    """
+    return bounds(BoundsSolver(limits, dt, **options), q, v)
+
+
+def bounds(solver: BoundsSolver, q: Array, v: Array) -> AccelerationBounds:
+    """Return the bounds of states of any shape (..., n) by a solver, as `solver.bounds` does.
+
+    Args:
+        solver: of n joints, with its margins.
+        q: shape (..., n), rad.
+        v: same shape, type and device, rad/s.
+
+    Returns:
+        Arrays of the shape, type and device of `q`. In float64 they are those of the solver; in
+        float32 limits are kept up to the rounding of float32.
+
+    Raises:
+        JointLimitsError: the shapes differ, or do not fit the number of joints.
+    """
+    xp = array_namespace(q, v)
+    n = len(solver.limits)
+    if q.shape != v.shape or q.shape[-1:] != (n,):
+        shapes = f"with q of shape {tuple(q.shape)} and v of shape {tuple(v.shape)}"
+        raise JointLimitsError("state", None, shapes, f"both must have shape (..., {n})")
+    table = np.stack([solver.table[name] for name in _Limit._fields])
+    table = xp.asarray(table, dtype=q.dtype, device=device(q))
+    above, below = _Limit(*table[..., 0]), _Limit(*table[..., 1])
+    room_above, room_below = above.position - q, below.position + q
+    high, keeps_high = _bound_towards(xp, room_above, v, above)
+    low, keeps_low = _bound_towards(xp, room_below, -v, below)
+    low = -low
+    either = _resolve_conflict(xp, room_above, room_below, v, low, high, above)
+    slow = xp.abs(v) - above.velocity_error <= above.v_max * (1.0 + ROUNDING)
+    lower, upper = xp.where(low > high, either, low), xp.where(low > high, either, high)
+    return AccelerationBounds(lower, upper, keeps_high & keeps_low & slow)
+
+
+class _Limit(NamedTuple):
+    """A position limit of each joint, arrays of shape (n,); `ONE_SIDED_LIMIT` says which."""
+
+    position: Array
+    dt: Array
+    twice_braking: Array
+    k: Array
+    free: Array
+    v_max: Array
+    low: Array
+    high: Array
+    margin: Array
+    velocity_error: Array
+    tolerance: Array
+
+
+def _bound_towards(xp: Any, room: Array, v: Array, limit: _Limit) -> tuple[Array, Array]:
+    """Return the largest acceleration that keeps a limit, and whether it can be kept."""
+    dt = limit.dt
+    fastest = v + limit.velocity_error
+    slowest = fastest - 2.0 * limit.velocity_error
+    budget = room - 0.5 * dt * fastest
+    # The largest end-of-step speed w with dt w / 2 + w^2 / (2 B) <= budget.
+    c = limit.twice_braking * xp.clip(budget, 0.0, limit.free)
+    w = xp.minimum(c / (limit.k + xp.sqrt(limit.k * limit.k + c)), limit.v_max)
+    w = xp.where(budget >= limit.free, limit.v_max, w)
+    # Stop within the step: eq. (19). Outside, and still leaving: brake.
+    inside = room > 0.0
+    stop = -fastest * (fastest / (2.0 * xp.where(inside, room, 1.0)))
+    stop = xp.where(inside, stop, limit.low)
+    # Outside and on the way back: be on the limit when the step ends.
+    back = (2.0 * budget / dt - fastest) / dt
+    a = xp.where(fastest > 0.0, stop, back)
+    a = xp.where(budget >= 0.0, (w - fastest) / dt, a) - limit.margin
+    # Written so that a NaN becomes `high`.
+    a = xp.where(a < limit.high, xp.where(a < limit.low, limit.low, a), limit.high)
+    room = room + limit.tolerance
+    stops = slowest * slowest <= limit.twice_braking * room
+    return a, xp.where(slowest <= 0.0, room >= 0.0, stops)
+
+
+def _resolve_conflict(
+    xp: Any, room_above: Array, room_below: Array, v: Array, low: Array, high: Array, limit: _Limit
+) -> Array:
+    """Return the one acceleration to use where the bounds of the two limits contradict."""
+    dt, v_max, error = limit.dt, limit.v_max, limit.velocity_error
+    direction = xp.where(room_below < 0.5 * dt * (error - v), v - error, v)
+    direction = xp.where(room_above < 0.5 * dt * (v + error), v + error, direction)
+    brake = (room_above < 0.0) | ((room_below >= 0.0) & (direction > 0.0))
+    release = (room_below < 0.0) | (direction < 0.0)
+    a = xp.where(brake, low, xp.where(release, high, 0.5 * (low + high)))
+    margin = limit.margin + error / dt
+    a = xp.maximum(xp.minimum(a, (v_max - v) / dt - margin), (-v_max - v) / dt + margin)
+    return xp.clip(a, limit.low, limit.high)
