@@ -147,6 +147,17 @@ class BulletRobot(BulletBody):
         self._asked[:] = tau
         self._advance(substeps)
 
+    def step_by(self, torque: Callable[[], Array], substeps: int = 1) -> None:
+        """Apply joint torques that the drives compute anew in each physics step.
+
+        Args:
+            torque: returns those of the motors, shape (n,), N m; not clipped.
+            substeps: how many physics steps, at least 1.
+        """
+        self._driving, self._law = False, None
+        self._release_brakes()
+        self._advance(substeps, torque)
+
     def move(
         self,
         q: ArrayLike,

@@ -28,6 +28,8 @@ from sim_bridge.node.topics import CLOCK, PAUSE, RECORDED, RESET
 from sim_bridge.node.world_subscriber import WorldSubscriber
 from viability_bounds_pkg.plausible import RESTART_GAP
 from viability_bounds_pkg.recent_values import RecentValues
+from viability_bounds_pkg.robot.configuration import load_model
+from viability_bounds_pkg.robot.gravity import gravity_beyond
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
 from viability_bounds_pkg.ros.messages import PositionCommand, TorqueCommand, wrench_message
@@ -115,7 +117,12 @@ class BulletNode(ArmNode):
         self._ft_publisher = self.stream(FT_WRENCH) if self._robot.sensor else None
         self._told_slow = False
         self._sensing = Sensing(config.imperfections, config.torque_max, config.dt)
-        self._commands = CommandStream(config, self._refused, self.get_logger().warning)
+        model = load_model(config, config.urdf)
+        self._gravity = gravity_beyond(model, config.command_includes_gravity)
+        self._not_reported = gravity_beyond(model, config.effort_includes_gravity)
+        self._commands = CommandStream(
+            config, self._refused, self.get_logger().warning, self._asked
+        )
         self._restart()
         self._make_interface()
         self.announce(config.joints, config.rate_hz, f"simulated, clock {config.clock}")
@@ -183,6 +190,8 @@ class BulletNode(ArmNode):
         self._stamp += self._dt_ns
         self._advanced = False
         q, v, tau = self._reading
+        if self._not_reported is not None:
+            tau = tau - self._not_reported(q)
         # New messages: nodes of this process may keep the last ones, and others get theirs later.
         state = self._state = JointState(
             name=self._names,
@@ -224,9 +233,12 @@ class BulletNode(ArmNode):
                 self._robot.brake(config.substeps, config.torque_max)
         elif isinstance(command, TorqueCommand):
             if self._stop is None or (commands.missed_in_row == 0 and not self._robot.returning):
-                self._robot.step(command.tau, config.substeps)
+                if self._gravity is None:
+                    self._robot.step(self._given(command.tau), config.substeps)
+                else:
+                    self._robot.step_by(lambda: self._given(command.tau), config.substeps)
             else:
-                self._robot.follow(self._stop, command.tau, config.substeps)
+                self._robot.follow(self._stop, self._given(command.tau), config.substeps)
         else:
             self._robot.move(*command, config.torque_max, config.velocity_max, config.substeps)
         self._reading = self._sensing.read(*self._true_state())
@@ -236,6 +248,15 @@ class BulletNode(ArmNode):
         if self._periods >= self._pause_at:
             self._pause_at = math.inf
             self._pause()
+
+    def _asked(self, command: Array) -> Array:
+        """Return the torque that a command asks the motors for now, shape (n,), N m."""
+        return command if self._gravity is None else command + self._gravity(self.true_positions)
+
+    def _given(self, command: Array) -> Array:
+        """Return that torque within the limits of the motors, which they do not exceed."""
+        most = self._config.torque_max
+        return np.minimum(np.maximum(self._asked(command), -most), most)
 
     def _tick(self) -> None:
         """End a period in real time and begin the next."""

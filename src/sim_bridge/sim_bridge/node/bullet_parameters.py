@@ -42,6 +42,7 @@ from viability_bounds_pkg.robot.configuration import (
     load_model,
 )
 from viability_bounds_pkg.robot.files import RobotDescriptionError
+from viability_bounds_pkg.robot.gravity import TorqueConvention
 from viability_bounds_pkg.stop import CoordinatedStop
 
 Array = NDArray[np.float64]
@@ -53,7 +54,7 @@ _OBSERVER_TIME = 0.002
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
+class BulletConfiguration(ControlRate, TorqueConvention, LimitedRobotConfiguration):
     """Parameters of the robot node; arrays of shape (n,) in `joints` order.
 
     Attributes:

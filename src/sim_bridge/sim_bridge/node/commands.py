@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
 from sim_bridge.command_path import CommandPath
@@ -16,6 +17,8 @@ from sim_bridge.node.bullet_parameters import BulletConfiguration
 from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.ros.messages import CommandReader, JointCommand, TorqueCommand
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
+
+Array = NDArray[np.float64]
 
 _STRAYS = 50
 """Commands in a row for other periods after which a warning is logged."""
@@ -30,6 +33,7 @@ class CommandStream:
         config: of the robot.
         refused: counts messages that are dropped, by reason.
         warn: logs a warning.
+        asked: returns the torque that a command asks the motors for, shape (n,), N m.
 
     Attributes:
         acting: the command of the present period; None if the robot stops itself.
@@ -46,8 +50,9 @@ class CommandStream:
         config: BulletConfiguration,
         refused: Counter[str],
         warn: Callable[[str], object],
+        asked: Callable[[Array], Array],
     ) -> None:
-        self._config, self._refused = config, refused
+        self._config, self._refused, self._asked = config, refused, asked
         self._warn = warn
         self._reader = CommandReader(config.joints, refused, warn)
         self._dt_ns = round(1e9 * config.dt)
@@ -124,11 +129,8 @@ class CommandStream:
     def _read(self, message: JointState) -> JointCommand | None:
         command = self._reader.read(message)
         if isinstance(command, TorqueCommand):
-            tau, tau_max = command.tau, self._config.torque_max
-            ratio = max((np.abs(tau) / tau_max).tolist())
-            self.torque_ratio = max(self.torque_ratio, ratio)
-            if ratio > 1.0:  # the motors do not exceed their limits, whatever the command
-                command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
+            share = np.abs(self._asked(command.tau)) / self._config.torque_max
+            self.torque_ratio = max(self.torque_ratio, *share.tolist())
         return command
 
     def _count_stray(self, own: int, stamp: int) -> None:

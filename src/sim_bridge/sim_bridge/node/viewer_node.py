@@ -41,6 +41,7 @@ from viability_bounds_pkg.robot.configuration import (
 )
 from viability_bounds_pkg.robot.description import frame_id
 from viability_bounds_pkg.robot.files import RobotDescriptionError
+from viability_bounds_pkg.robot.gravity import TorqueConvention, gravity_beyond
 from viability_bounds_pkg.robot.locked_joints import LockedJoints
 from viability_bounds_pkg.robot.payload import Payload
 from viability_bounds_pkg.ros.arm_node import ArmNode
@@ -87,6 +88,7 @@ class ViewerConfiguration(TaskFrames, LimitedRobotConfiguration):
         limits: of the joints.
     """
 
+    effort_includes_gravity: bool = redeclared(TorqueConvention, "effort_includes_gravity")
     acceleration_min: Array = redeclared(BoundsConfiguration, "acceleration_min")
     acceleration_max: Array = redeclared(BoundsConfiguration, "acceleration_max")
     viewer_host: str = text("address of the page", default="127.0.0.1")
@@ -185,7 +187,8 @@ class ViewerNode(ArmNode):
             frames = config.end_effectors, config.base_frame
             self._locked = LockedJoints(config, urdf, model, Payload(model), *frames)
         self._units = units_of(urdf, config.joints)
-        self._reader = JointStateReader(config.joints, warn=self._warn)
+        gravity = gravity_beyond(model, config.effort_includes_gravity)
+        self._reader = JointStateReader(config.joints, warn=self._warn, gravity=gravity)
         self._unknown = np.full(len(config.joints), math.nan)
         self._limits = self._unknown, self._unknown
         self._before: tuple[int, Array] | None = None  # stamp, ns, and speeds in the last picture

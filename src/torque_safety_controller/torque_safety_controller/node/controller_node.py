@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
@@ -33,6 +35,7 @@ from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.step import too_weak_at
 from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.node.bounds_parameters import make_plausibility_check
+from viability_bounds_pkg.robot.gravity import gravity_beyond
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
 from viability_bounds_pkg.ros.messages import Arrival
@@ -42,6 +45,8 @@ from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.runtime import steady_timer
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS
 from viability_bounds_pkg.state import State
+
+Array = NDArray[np.float64]
 
 QUIET = 1.5
 """Time without a joint state after which the robot is silent, in times of `bounds_timeout`."""
@@ -73,8 +78,15 @@ class ControllerNode(ArmNode):
         if not config.use_estimated_states:
             errors = None if declared is None else declared.declared
             check = make_plausibility_check(config, errors)
+        model = self._controller.robot.model
+        self._gravity = gravity_beyond(model, config.command_includes_gravity)
         self._states = StateStream(
-            config.joints, config.state_timeout, self._warn, check, config.continuous
+            config.joints,
+            config.state_timeout,
+            self._warn,
+            check,
+            config.continuous,
+            gravity_beyond(model, config.effort_includes_gravity),
         )
         self._limits = LimitsReader(config.joints, self._warn)
         self._goals = GoalSubscriber(self, self._controller, config, base, self._states)
@@ -124,12 +136,14 @@ class ControllerNode(ArmNode):
                 "not avoid them"
             )
         clipped = "; torque_rate_max is clipped: limits are not promised with it"
+        gravity = "with" if config.command_includes_gravity else "without"
         avoiding = "with" if config.collision.collision_avoidance else "without"
         self.announce(
             config.joints,
             config.rate_hz,
-            f"{config.start_control} control, integral action {config.integral.integral_action}, "
-            f"{avoiding} collision avoidance{clipped if config.clips_torque_rates else ''}",
+            f"{config.start_control} control, torques {gravity} gravity, integral action "
+            f"{config.integral.integral_action}, {avoiding} collision avoidance"
+            f"{clipped if config.clips_torque_rates else ''}",
         )
 
     def _configure(self, config: ControllerConfiguration) -> None:
@@ -242,11 +256,17 @@ class ControllerNode(ArmNode):
             supervisor.answered()
             return
         step = self._controller.step(state, limits, order, elapsed)
-        self._commands.torque(step.tau, stamp)
+        self._commands.torque(self._for_robot(step.tau, state), stamp)
         states.mark_answered()
         supervisor.answered(step.tau, step.failure, step.planned)
         self._report.add(step, time.monotonic() - states.message_at)
         self._wrenches.log_changes()
+
+    def _for_robot(self, tau: Array, state: State) -> Array:
+        """Return torques of the motors less what the robot adds, in the middle of the period."""
+        if self._gravity is None:
+            return tau
+        return tau - self._gravity(state.q + 0.5 * self._config.dt * state.v)
 
     # Handover
 

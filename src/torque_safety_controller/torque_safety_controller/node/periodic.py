@@ -20,6 +20,7 @@ from torque_safety_controller.node.topics import ROS2_CONTROL_EFFORTS
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.plausible import RESTART_GAP, PlausibilityCheck
+from viability_bounds_pkg.robot.gravity import Gravity
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Arrival, JointOrder, JointStateReader, count_refusal
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
@@ -40,7 +41,7 @@ class StateStream(JointStateReader):
         timeout: how long without a usable state until the arm counts as silent, s.
         warn: told in words when a state is dropped for a reason for the first time.
         check: of what is finite; None to accept it.
-        continuous: see `JointStateReader`.
+        continuous, gravity: see `JointStateReader`.
 
     Attributes:
         message_at: when the last message came, usable or not, s on the steady clock.
@@ -61,8 +62,9 @@ class StateStream(JointStateReader):
         warn: Callable[[str], object] | None = None,
         check: PlausibilityCheck | None = None,
         continuous: NDArray[np.bool_] | None = None,
+        gravity: Gravity | None = None,
     ) -> None:
-        super().__init__(joints, timeout, warn, check, continuous=continuous)
+        super().__init__(joints, timeout, warn, check, continuous=continuous, gravity=gravity)
         self._timeout = timeout
         self.message_at = self.usable_at = self.waiting_since = -math.inf
         self.message_stamp: Any = None

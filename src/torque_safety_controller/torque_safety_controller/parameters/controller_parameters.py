@@ -44,6 +44,7 @@ from viability_bounds_pkg.robot.configuration import (
     StateSource,
     TaskFrames,
 )
+from viability_bounds_pkg.robot.gravity import TorqueConvention
 
 Array = NDArray[np.float64]
 
@@ -176,7 +177,9 @@ class FrictionConfiguration:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfiguration):
+class ControllerConfiguration(
+    StateSource, ControlRate, TaskFrames, TorqueConvention, RobotConfiguration
+):
     """Parameters of the controller node; arrays of shape (n,) in `joints` order.
 
     Attributes:

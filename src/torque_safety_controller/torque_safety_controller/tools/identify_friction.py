@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from viability_bounds_pkg.cli.limits_file import (
     write_whole,
 )
 from viability_bounds_pkg.parameter_files import ParameterFileError
+from viability_bounds_pkg.robot.gravity import gravity_beyond
 
 NODE = "/**/controller_node"
 """Node that the written parameters are for."""
@@ -54,6 +56,11 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add(
         "-o", "--output", type=Path, help="parameter file to write, to be passed after the robot's"
     )
+    add(
+        "--add-gravity",
+        action="store_true",
+        help="the recorded torques lack what holds the arm against gravity",
+    )
     return parser.parse_args(arguments)
 
 
@@ -68,6 +75,9 @@ def _run(options: argparse.Namespace) -> int:
     names = list(model.names)[1:]
     recording = load_recording(options.recording, names)
     _check_positions(options.recording, names, recording.q, robot)
+    if options.add_gravity and (gravity := gravity_beyond(model, included=False)):
+        tau = recording.tau + [gravity(q) for q in recording.q]
+        recording = replace(recording, tau=tau)
     if recording.lost:
         samples = len(recording.t) + recording.lost
         print(f"{recording.lost} of {samples} samples lack numbers, and are left out")

@@ -139,7 +139,7 @@ class BoundsNode(ArmNode):
             position=array("d", distances.tobytes()),
             velocity=array("d", (config.velocity_max - np.abs(reader.v)).tobytes()),
         )
-        if tau is not None and len(config.torque_max):
+        if tau is not None and len(config.torque_max) and config.effort_includes_gravity:
             message.effort = array("d", (config.torque_max - np.abs(tau)).tobytes())
         set_stamp(message.header.stamp, reader.stamp)
         return message

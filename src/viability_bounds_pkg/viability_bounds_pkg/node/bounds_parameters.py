@@ -35,6 +35,7 @@ from viability_bounds_pkg.robot.configuration import (
     RobotConfiguration,
     StateSource,
 )
+from viability_bounds_pkg.robot.gravity import TorqueConvention
 from viability_bounds_pkg.uncertainty import (
     DeclaredUncertainty,
     Loop,
@@ -72,6 +73,7 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
 
     robot_description: str = redeclared(RobotConfiguration, "robot_description", default="")
     NOT_NEEDED = frozenset({"torque_max"})
+    effort_includes_gravity: bool = redeclared(TorqueConvention, "effort_includes_gravity")
     acceleration_min: Array = joint_numbers("lower acceleration limits, rad/s^2", NEGATIVE)
     acceleration_max: Array = joint_numbers("upper acceleration limits, rad/s^2", POSITIVE)
     acceleration_drift: Array = joint_amounts(

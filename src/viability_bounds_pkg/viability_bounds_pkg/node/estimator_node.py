@@ -21,6 +21,7 @@ from viability_bounds_pkg.robot.configuration import (
     LimitedRobotConfiguration,
     load_model,
 )
+from viability_bounds_pkg.robot.gravity import TorqueConvention, gravity_beyond
 from viability_bounds_pkg.robot.locked_joints import LockedJoints
 from viability_bounds_pkg.robot.payload import Payload
 from viability_bounds_pkg.ros.arm_node import ArmNode
@@ -45,7 +46,9 @@ from viability_bounds_pkg.uncertainty import DeclaredUncertainty, VelocityEstima
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class EstimatorConfiguration(VelocityEstimation, ControlRate, LimitedRobotConfiguration):
+class EstimatorConfiguration(
+    VelocityEstimation, ControlRate, TorqueConvention, LimitedRobotConfiguration
+):
     """Parameters of the estimator node."""
 
     declared: DeclaredUncertainty = group(DeclaredUncertainty)
@@ -110,7 +113,9 @@ class EstimatorNode(ArmNode):
             check,
             needs_velocities=not config.velocity_estimation,
             continuous=config.continuous,
+            gravity=gravity_beyond(model, config.effort_includes_gravity),
         )
+        self._gravity = gravity_beyond(model, config.command_includes_gravity)
         self._period = PeriodCheck(config.dt, self._warn)
         self._refused: Counter[str] = Counter()
         self._commands = CommandReader(joints, self._refused, self._warn)
@@ -161,8 +166,11 @@ class EstimatorNode(ArmNode):
             return
         tau = None
         if isinstance(command, TorqueCommand):
+            tau = command.tau
+            if self._gravity is not None:
+                tau = tau + self._gravity(self._reader.q)
             tau_max = self._config.torque_max  # motors do not exceed it, whatever the command
-            tau = np.clip(command.tau, -tau_max, tau_max)
+            tau = np.clip(tau, -tau_max, tau_max)
         self._estimator.answer(stamp_to_ns(message.header.stamp), tau)
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:

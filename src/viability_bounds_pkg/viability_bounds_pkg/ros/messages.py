@@ -19,6 +19,7 @@ from sensor_msgs.msg import JointState
 
 from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.plausible import PlausibilityCheck
+from viability_bounds_pkg.robot.gravity import Gravity
 from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
 from viability_bounds_pkg.state import State, whole_turns
 
@@ -124,6 +125,7 @@ class JointStateReader:
             they are those at which the positions have changed since the last accepted message.
         continuous: whether a joint turns without end, shape (n,): its driver may report angles in
             any turn; None for no joint.
+        gravity: what the motors give beyond the effort that is reported; None for nothing.
 
     Attributes:
         accepted: how many new states were accepted.
@@ -144,7 +146,9 @@ class JointStateReader:
         check: PlausibilityCheck | None = None,
         needs_velocities: bool = True,
         continuous: NDArray[np.bool_] | None = None,
+        gravity: Gravity | None = None,
     ) -> None:
+        self._gravity = gravity
         self._order, self._reset_after = JointOrder(joints), reset_after
         self._warn, self._check, self._needs_velocities = warn, check, needs_velocities
         self._continuous = continuous if continuous is not None and continuous.any() else None
@@ -224,6 +228,8 @@ class JointStateReader:
             return None
         self._order.find(message.name)
         tau = np.array(message.effort)[self._order.index]
+        if self._gravity is not None:
+            tau += self._gravity(self.q)
         return tau if all(map(math.isfinite, tau.tolist())) else None
 
     def with_state(self, state: State) -> JointState:
