@@ -2,7 +2,8 @@
 """Compiles ahead what the nodes use, so that no start has to wait for it. Part of `setup.sh`.
 
 The robots of `config/` make a few control steps: each function is compiled for the types that it
-is called with, and Numba keeps the results beside the sources.
+is called with, and Numba keeps the results beside the sources. What a robot uses besides is
+compiled when its nodes start for the first time.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ CONFIG = Path(__file__).resolve().parent.parent / "config"
 
 
 def main() -> None:
-    """Play a few steps of each robot, and of one beside a wall in each mode of integral action."""
-    argparse.ArgumentParser(prog="compile.py", description=__doc__).parse_args()
+    """Play a few steps of each robot; with ``--all`` also beside a wall, by mode of integral."""
+    parser = argparse.ArgumentParser(prog="compile.py", description=__doc__)
+    parser.add_argument("--all", action="store_true", help="also what these robots do not use")
+    options = parser.parse_args()
     for path in sorted(CONFIG.glob("*.yaml")):
         try:
             loop = DirectLoop(path.stem)
@@ -29,7 +32,7 @@ def main() -> None:
         except ArmSafetyError as error:  # a file of the user's; its nodes will say so, too
             print(f"setup: nothing is compiled for {path.name}: {error}", file=sys.stderr)
     (wall,) = yaml.safe_load((CONFIG / "obstacles" / "panda_wall.yaml").read_text()).values()
-    for mode in ("joints", "task"):
+    for mode in ("joints", "task") if options.all else ():
         loop = DirectLoop("panda", wall["ros__parameters"] | {"integral_action": mode})
         loop.run(2.0 * loop.dt)
 

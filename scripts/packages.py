@@ -3,6 +3,7 @@
 
     python3 scripts/packages.py fingerprint            changes when the system's packages change
     python3 scripts/packages.py plan sourced|wheels    writes what is to be installed into .venv
+    .venv/bin/python scripts/packages.py leave_out            deletes what nothing here reads
     .venv/bin/python scripts/packages.py report        checks and lists what was installed
 
 Runs without any package. Beside a sourced ROS 2, a package of the system is used where it is new
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shutil
 import subprocess
 import sys
 from importlib import metadata
@@ -164,6 +166,21 @@ def plan(kind: str) -> None:
         (VENV / f"{name}.txt").write_text("".join(f"{line}\n" for line in lines))
 
 
+def leave_out() -> None:
+    """Delete what `left_out.txt` names of the packages that were installed."""
+    for pattern in names("left_out.txt"):
+        for path in installed().glob(pattern):
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+
+
+def installed() -> Path:
+    """Return the folder of the packages in the virtual environment that runs this."""
+    return next(Path(path) for path in sys.path if Path(path).is_relative_to(f"{sys.prefix}/lib"))
+
+
 def report() -> None:
     """List the packages: version, from where, size. Check that each runs, and that NumPy is kept.
 
@@ -172,9 +189,9 @@ def report() -> None:
     """
     venv = Path(sys.prefix)
     sizes: dict[str, float] = {}
-    site = next(path for path in sys.path if Path(path).is_relative_to(venv / "lib"))
-    for each in metadata.distributions(path=[site]):
-        size = sum(file.size or 0 for file in each.files or ())
+    for each in metadata.distributions(path=[str(installed())]):
+        files = (os.path.join(each.locate_file(""), file) for file in each.files or ())
+        size = sum(os.path.getsize(file) for file in files if os.path.exists(file))
         sizes[re.sub("[-_.]+", "-", each.metadata["Name"]).lower()] = size / 1e6
     total = sum(sizes.values())
     pins = (venv / "constraints.txt").read_text().splitlines()
@@ -206,12 +223,15 @@ def main() -> None:
     tasks = parser.add_subparsers(dest="task", required=True)
     tasks.add_parser("fingerprint")
     tasks.add_parser("plan").add_argument("kind", choices=["sourced", "wheels"])
+    tasks.add_parser("leave_out")
     tasks.add_parser("report")
     options = parser.parse_args()
     if options.task == "fingerprint":
         print(fingerprint())
     elif options.task == "plan":
         plan(options.kind)
+    elif options.task == "leave_out":
+        leave_out()
     else:
         report()
 

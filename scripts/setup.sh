@@ -22,6 +22,7 @@ USAGE
 
 _setup() {
     local root python venv stamp wanted inputs
+    local -x PYTHONDONTWRITEBYTECODE= # compiled modules are kept, for all later starts
     root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
     python="${PYTHON:-python3}"
     venv="$root/.venv"
@@ -53,7 +54,7 @@ print(sys._base_executable if sys.prefix == sys.argv[1] else sys.executable)' "$
 
     # The inputs of an installation; when one of them changes, it is repeated.
     stamp="$venv/.installed"
-    inputs="$(cat "$root"/requirements/{common,constraints,pinocchio,wheels}.txt; echo "$ros"
+    inputs="$(cat "$root"/requirements/{common,constraints,left_out,pinocchio,wheels}.txt; echo "$ros"
         "$python" --version; [ "$ros" = wheels ] || _packages fingerprint)"
     wanted="$(printf '%s' "$inputs" | sha256sum | cut -d' ' -f1)"
     if [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ]; then
@@ -92,22 +93,34 @@ _install() {
             "on Ubuntu: sudo apt install python3-venv" >&2
         return 1
     fi
-    echo "setup: this downloads up to 0.5 GB, fills up to 1.9 GB in .venv, and takes minutes" >&2
+    echo "setup: this downloads up to 0.5 GB, fills up to 1.4 GB in .venv, and takes minutes" >&2
     if ! output="$("$python" -m venv --clear "${options[@]}" "$venv" 2>&1)"; then
         _explain "making .venv"
         return 1
     fi
     _packages plan "$ros" >&2 || return 1
-    _install_pybullet || return 1
+    mkdir "$venv/wheels"
+    # In a shell of its own, because an interactive one would report the job.
+    (_fetch & _install_pybullet; status=$?; wait; exit "$status") || return 1
     # Without dependencies what would replace the system's NumPy, see requirements/pinocchio.txt.
     [ ! -s "$venv/no_deps.txt" ] || _pip --no-deps -r "$venv/no_deps.txt" || return 1
     _pip -r "$venv/requirements.txt" || return 1
+    rm -rf "$venv/wheels"
+    "$venv/bin/python" "$root/scripts/packages.py" leave_out
     "$venv/bin/python" "$root/scripts/packages.py" report >&2
 }
 
+# Downloads several packages at a time, which pip by itself does not; what fails fails again in _pip.
+_fetch() {
+    cat "$venv/no_deps.txt" "$venv/requirements.txt" | xargs -n 8 -P 4 \
+        "$venv/bin/python" -m pip download --disable-pip-version-check --no-deps \
+        --constraint "$venv/constraints.txt" --dest "$venv/wheels" >/dev/null 2>&1
+}
+
+# Python compiles what is imported, which is a small part.
 _pip() {
-    if ! output="$("$venv/bin/python" -m pip install --disable-pip-version-check \
-        --constraint "$venv/constraints.txt" "$@" 2>&1)"; then
+    if ! output="$("$venv/bin/python" -m pip install --disable-pip-version-check --no-compile \
+        --find-links "$venv/wheels" --constraint "$venv/constraints.txt" "$@" 2>&1)"; then
         _explain "installing packages"
         return 1
     fi
@@ -120,7 +133,7 @@ _explain() {
     free="$(df --output=avail "$venv" | tail -n 1)" # KB; ensurepip does not say that it has none
     if [ "$free" -lt 20000 ] ||
         [[ "${output,,}" =~ 'no space left'|'errno 28'|'disk quota exceeded' ]]; then
-        why="no space is left. .venv needs 2 GB; free are $((free / 1000)) MB in $venv and"
+        why="no space is left. .venv needs 2.5 GB; free are $((free / 1000)) MB in $venv and"
         why+=" $(df -h --output=avail "${TMPDIR:-/tmp}" | tail -n 1) in ${TMPDIR:-/tmp}"
     elif [[ "$output" =~ 'connection broken'|'ConnectTimeout'|'ReadTimeout'|'Max retries' ]]; then
         why="the package index cannot be reached (network, proxy, or pip's configuration)"
@@ -177,7 +190,7 @@ _compile() {
     if [ "$(cat "$compiled" 2>/dev/null)" = "$now" ]; then
         return 0
     fi
-    echo "setup: compiling what Numba compiles, about a minute" >&2
+    echo "setup: compiling what Numba compiles, half a minute" >&2
     if ! PYTHONPATH="$root/reproduction:${PYTHONPATH:-}" python "$root/scripts/compile.py"; then
         echo "setup: compiling ahead failed; the nodes compile when they start" >&2
         return 0
@@ -188,7 +201,7 @@ _compile() {
 # Scripts source it with their own arguments in place.
 if [ -z "${BASH_SOURCE[1]:-}" ] && [[ "${1:-}" =~ ^(-h|--help)$ ]]; then
     _usage
-    unset -f _usage _setup _install _install_pybullet _build _compile
+    unset -f _usage _setup _packages _install _fetch _pip _explain _install_pybullet _build _compile
     return 0 2>/dev/null || exit 0
 fi
 
@@ -198,6 +211,6 @@ flock "$_lock"
 _setup
 _status=$?
 exec {_lock}>&-
-unset -f _usage _setup _packages _install _pip _explain _install_pybullet _build _compile
+unset -f _usage _setup _packages _install _fetch _pip _explain _install_pybullet _build _compile
 unset _lock
 (exit $_status)

@@ -23,6 +23,15 @@ root="$(cd "$(dirname "$0")/.." && pwd)"
 # shellcheck source=scripts/environment.sh
 source "$root/scripts/environment.sh"
 cd "$root"
+# What only tests need, once.
+if [ ! .venv/.tests -nt requirements/tests.txt ]; then
+    echo "test: installing and compiling what only tests need" >&2
+    python -m pip install --quiet --disable-pip-version-check --no-compile \
+        --constraint .venv/constraints.txt -r requirements/tests.txt
+    PYTHONDONTWRITEBYTECODE= PYTHONPATH="$root/reproduction:${PYTHONPATH:-}" \
+        python scripts/compile.py --all
+    touch .venv/.tests
+fi
 # So that what is compiled of tests and sources to be imported is kept for the other processes.
 unset PYTHONDONTWRITEBYTECODE
 # One process more than cores, because some tests wait.

@@ -99,7 +99,7 @@ def test_a_full_disk(copy):
     finally:
         subprocess.run(["umount", venv], check=True)
     assert code == 1
-    assert "setup: installing packages failed: no space is left. .venv needs 2 GB" in said
+    assert "setup: installing packages failed: no space is left. .venv needs 2.5 GB" in said
     assert "network" not in said
 
 
