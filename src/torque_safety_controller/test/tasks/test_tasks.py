@@ -164,3 +164,15 @@ def test_posture_in_the_null_space_leaves_the_pose_reached_and_else_they_comprom
         q, v = q + dt * v + 0.5 * dt * dt * a, v + dt * a
     assert least < np.abs(pose_error(updated(arm, q, v).pose, goal)).max() < most
     assert np.abs(q - arm.q_start).max() > 0.05  # rad
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.5, 2.0, 3.0, np.pi - 1e-3, np.pi - 1e-9])
+def test_separate_error_turns_the_shorter_way(arm, angle):
+    """The angular part of the task is kp log(R'R_d), whatever quaternion that is told by."""
+    robot, rng = updated(arm, arm.q_start, np.zeros(arm.n)), np.random.default_rng(5)
+    for _ in range(20):
+        axis = rng.normal(size=3)
+        vector = angle * axis / np.linalg.norm(axis)
+        goal = robot.pose * pin.SE3(pin.exp3(vector), np.zeros(3))
+        b = PoseTask(goal, 1.0, 0.0, 1.0, separate=True).term(robot).b
+        np.testing.assert_allclose(b, np.r_[np.zeros(3), vector], atol=1e-12)  # rad/s^2

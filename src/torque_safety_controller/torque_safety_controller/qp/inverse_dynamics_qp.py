@@ -239,7 +239,6 @@ def _write(
             C[i, j] = M[i, j]
         lower[i], upper[i] = a_lower[i], a_upper[i]
         lower[size + i], upper[size + i] = tau_lower[i], tau_upper[i]
-    return H, g, C, lower, upper
 
 
 @njit(cache=True)
