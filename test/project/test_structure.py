@@ -162,7 +162,8 @@ KEYS = {name: f"python3-{name}" for name in NAMES.split()} | {"pybullet": "pytho
 """Keys of rosdep that are not named like the module."""
 
 KEYLESS = {name: name for name in ("daqp", "viser", "trimesh", "mcap")} | {
-    "mcap_ros2": "mcap-ros2-support"
+    "mcap_ros2": "mcap-ros2-support",
+    "array_api_compat": "array-api-compat",
 }
 """Modules without a key of rosdep; a comment tells what to install."""
 

@@ -125,37 +125,37 @@ def _add_terms(bodies: Bodies, q: Array, v: Array, h: Array, inertia: Array) -> 
                 j = bodies.parent[j]
 
 
-@njit
+@njit(cache=True, error_model="numpy")
 def _row(array: Array, k: int) -> Vector:
     return array[k, 0], array[k, 1], array[k, 2]
 
 
-@njit
+@njit(cache=True, error_model="numpy")
 def _put(array: Array, k: int, x: Vector) -> None:
     array[k, 0], array[k, 1], array[k, 2] = x
 
 
-@njit
+@njit(cache=True, error_model="numpy")
 def _dot(x: Vector, y: Vector) -> float:
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
 
 
-@njit
+@njit(cache=True, error_model="numpy")
 def _cross(x: Vector, y: Vector) -> Vector:
     return x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
 
 
-@njit
+@njit(cache=True, error_model="numpy")
 def _sum(x: Vector, y: Vector, factor: float) -> Vector:
     return x[0] + factor * y[0], x[1] + factor * y[1], x[2] + factor * y[2]
 
 
-@njit
+@njit(cache=True, error_model="numpy")
 def _times(matrix: Array, x: Vector) -> Vector:
     return _dot(_row(matrix, 0), x), _dot(_row(matrix, 1), x), _dot(_row(matrix, 2), x)
 
 
-@njit
+@njit(cache=True, error_model="numpy")
 def _product(left: Array, right: Array, out: Array) -> None:
     for i in range(3):
         for j in range(3):
@@ -164,7 +164,7 @@ def _product(left: Array, right: Array, out: Array) -> None:
             )
 
 
-@njit
+@njit(cache=True, error_model="numpy")
 def _rotate(axes: Array, z: Vector, angle: float, out: Array) -> None:
     """Write `axes` turned about `z`, a unit vector or zero: Rodrigues' formula."""
     s, c = sin(angle), cos(angle)
@@ -175,7 +175,7 @@ def _rotate(axes: Array, z: Vector, angle: float, out: Array) -> None:
             out[j, i] = c * x[j] + s * across[j] + along * z[j]
 
 
-@njit
+@njit(cache=True, error_model="numpy")
 def _carried(alpha: Vector, omega: Vector, r: Vector) -> Vector:
     """Return the acceleration of a point at `r` on a body whose origin does not accelerate."""
     return _sum(_cross(alpha, r), _cross(omega, _cross(omega, r)), 1.0)
