@@ -128,6 +128,14 @@ def test_same_seed_same_limits(search):
     assert np.any(first.q != other.q)
 
 
+@pytest.mark.parametrize("search", [search_by_sampling, search_refined])
+def test_progress_grows_up_to_the_whole(search):
+    model, shares = pendulum(), []
+    search(model, StateSpace.of(model, *limits_of(model)), 3000, 0, shares.append)
+    assert len(shares) > 2 and shares == sorted(shares)
+    assert 0.0 < shares[0] < 1.0 and shares[-1] <= 1.0
+
+
 def test_limits_of_a_share_are_available_in_as_many_other_states():
     """By Algorithm 4's lines for single states, which are others than those used."""
     model, share = baxter(), 0.8

@@ -151,7 +151,8 @@ def _run(options: argparse.Namespace) -> int:
     torque = (1.0 - options.torque_reserve) * robot.tau_max
     space = StateSpace.of(robot.model, robot.q_min, robot.q_max, robot.v_max, torque)
     search = SEARCHES[options.method]
-    worst = search(robot.model, space, options.samples, options.seed)
+    worst = search(robot.model, space, options.samples, options.seed, _show)
+    _show(1.0)
     _report_search(names, robot.units, worst)
     if options.share > 0.0:
         overrides = _in_share(robot, space, worst, options.share) | overrides
@@ -182,6 +183,13 @@ def _run(options: argparse.Namespace) -> int:
         raise
     print(f"\nwritten to {options.output}")
     return 0
+
+
+def _show(share: float) -> None:
+    """Show on a terminal how much of the search is done, and nothing when all is."""
+    if sys.stderr.isatty():
+        bar = f"searching [{'#' * int(30 * share):30}] {share:.0%}" if share < 1.0 else ""
+        print(f"\r\033[K{bar}", end="", file=sys.stderr, flush=True)
 
 
 def _report_search(names: Sequence[str], units: Sequence[str], worst: WorstCases) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -175,7 +176,13 @@ def acceleration_room(
     return np.stack([(space.tau_max - h) / inertia, (space.tau_max + h) / inertia], axis=1)
 
 
-def search_by_sampling(model: pin.Model, space: StateSpace, samples: int, seed: int) -> WorstCases:
+def search_by_sampling(
+    model: pin.Model,
+    space: StateSpace,
+    samples: int,
+    seed: int,
+    progress: Callable[[float], None] = lambda share: None,
+) -> WorstCases:
     """Evaluate uniformly random states: Algorithm 4 of [DelPrete2018].
 
     The states of a shorter run with the same seed are the first ones of a longer run.
@@ -185,6 +192,7 @@ def search_by_sampling(model: pin.Model, space: StateSpace, samples: int, seed: 
         space: where states are drawn, and the torque limits.
         samples: how many states (the paper's N).
         seed: of the random generator.
+        progress: is told the share that is done, again and again.
 
     Raises:
         LimitEstimateError: fewer than one sample, or a joint that moves no inertia.
@@ -204,6 +212,7 @@ def search_by_sampling(model: pin.Model, space: StateSpace, samples: int, seed: 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for found in pool.map(evaluate, range(0, samples, CHUNK)):
             worst.update(*found)
+            progress(worst.evaluations / samples)
     return worst
 
 
@@ -212,7 +221,13 @@ def _require_samples(samples: int) -> None:
         raise LimitEstimateError(f"samples must be at least 1, is {samples}")
 
 
-def search_refined(model: pin.Model, space: StateSpace, evaluations: int, seed: int) -> WorstCases:
+def search_refined(
+    model: pin.Model,
+    space: StateSpace,
+    evaluations: int,
+    seed: int,
+    progress: Callable[[float], None] = lambda share: None,
+) -> WorstCases:
     """Sample, then descend to a local minimum from the worst states of each limit.
 
     Every other sample has all velocities at their limits, because h is quadratic in v and its
@@ -240,6 +255,7 @@ def search_refined(model: pin.Model, space: StateSpace, evaluations: int, seed: 
             _descend(
                 model, data, bodies, space, worst, unit[start], *divmod(limit, n), evaluations
             )
+            progress(worst.evaluations / evaluations)
         idle = 0 if np.any(worst.room < before - 1e-6 * np.abs(before)) else idle + 1
         if worst.evaluations + 2 > evaluations or idle == PATIENCE:
             break
