@@ -205,6 +205,7 @@ class Sensing:
         given, seed = imperfections, imperfections.imperfection_seed
         self._dt, self._delay = dt, given.state_delay
         self._coarse = given.encoder_resolution > 0.0
+        self._any_coarse = bool(self._coarse.any())
         self._resolution = np.where(self._coarse, given.encoder_resolution, 1.0)
         self._position_noise = ClippedNoise(given.position_noise, seed, RandomStream.POSITION)
         self._velocity_noise = ClippedNoise(given.velocity_noise, seed, RandomStream.VELOCITY)
@@ -244,6 +245,8 @@ class Sensing:
     def encoders(self, q: Array) -> Array:
         """Return whole encoder steps at positions `q`, with new noise, shape (n,), rad."""
         noisy = self._position_noise.added_to(q)
+        if not self._any_coarse:
+            return noisy
         steps = self._resolution * np.rint(noisy / self._resolution)
         return np.where(self._coarse, steps, noisy)
 

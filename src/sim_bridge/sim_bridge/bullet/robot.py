@@ -25,6 +25,7 @@ the maximum being at r = a h^2 / 8: 2 microrad for 15 rad/s^2 at 1 kHz.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -113,7 +114,7 @@ class BulletRobot(BulletBody):
     @property
     def finite(self) -> bool:
         """Whether the state is made of numbers; a push without measure leaves none."""
-        return bool(np.isfinite(self._q + self._v).all())
+        return all(map(math.isfinite, (self._q + self._v).tolist()))
 
     def reset(self, q: ArrayLike, v: ArrayLike) -> None:
         """Set the state of the joints, motors off; wrenches and monitor are not changed.

@@ -53,7 +53,7 @@ AHEAD = 20
 """Periods that a robot in lockstep goes on without its recorder; a socket's buffer keeps more."""
 
 SLOW_AFTER = 2.0
-"""After which the rate that the machine keeps is known, s."""
+"""How long the robot runs until the rate that the machine keeps is known, s."""
 
 SLOW = 0.95
 """Share of the control rate below which the machine is too slow."""
@@ -115,7 +115,7 @@ class BulletNode(ArmNode):
         )
         self._ft_wrench = WrenchStamped()
         self._ft_publisher = self.stream(FT_WRENCH) if self._robot.sensor else None
-        self._told_slow = False
+        self._compared = False
         self._sensing = Sensing(config.imperfections, config.torque_max, config.dt)
         model = load_model(config, config.urdf)
         self._gravity = gravity_beyond(model, config.command_includes_gravity)
@@ -387,8 +387,8 @@ class BulletNode(ArmNode):
             "lower_clearance_rad": monitor.closest_to_q_min,
             "upper_clearance_rad": monitor.closest_to_q_max,
         }
-        if not self._paused and elapsed > SLOW_AFTER:
-            self._tell_slow(values["rate_hz"])
+        if not self._compared and (self._periods + self._late) * self._config.dt > SLOW_AFTER:
+            self._compare_rate()
         if monitor.violated:
             return DiagnosticStatus.ERROR, "a limit was broken", values
         if self._paused:
@@ -400,16 +400,16 @@ class BulletNode(ArmNode):
             return DiagnosticStatus.WARN, f"{doing}: no commands", values
         return DiagnosticStatus.OK, "running", values
 
-    def _tell_slow(self, kept: float) -> None:
-        """Tell once that the machine simulates fewer periods than real time has."""
-        rate = self._config.rate_hz
-        if self._told_slow or self._config.lockstep or kept > SLOW * rate:
-            return
-        self._told_slow = True
-        self.get_logger().warning(
-            f"the simulation keeps {kept:.0f} of {rate:g} Hz here: set rate_hz of all nodes to "
-            f"{rate / math.ceil(rate / kept):.4g}, or clock to lockstep"
-        )
+    def _compare_rate(self) -> None:
+        """Tell, once after the start, where the machine simulates fewer periods than it should."""
+        self._compared = True
+        rate, due = self._config.rate_hz, self._periods + self._late
+        if self._periods < SLOW * due:
+            slower = rate / math.ceil(due / self._periods)
+            self.get_logger().warning(
+                f"the simulation keeps {rate * self._periods / due:.0f} of {rate:g} Hz here: set "
+                f"rate_hz of all nodes to {slower:.4g}, or clock to lockstep"
+            )
 
     def destroy_node(self) -> None:
         """Disconnect from the physics engine too."""

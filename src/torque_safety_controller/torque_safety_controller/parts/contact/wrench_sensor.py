@@ -99,9 +99,10 @@ class WrenchSensor:
             WrenchError: it is something else; nothing has changed then.
         """
         raw = np.array(raw, dtype=np.float64)
-        if raw.shape != (6,) or not np.isfinite(raw).all():
+        numbers = raw.ravel().tolist()
+        if raw.shape != (6,) or not all(map(math.isfinite, numbers)):
             raise WrenchError("not six finite numbers")
-        if np.abs(raw).max() > STRONGEST:
+        if max(map(abs, numbers)) > STRONGEST:
             raise WrenchError(f"beyond {STRONGEST:g} N or N m")
         self._raw = raw
 
