@@ -115,7 +115,7 @@ def refused():
 @pytest.fixture
 def stream(refused):
     config = read(BulletConfiguration, VALUES | {"command_delay": 2})
-    made = CommandStream(config, refused, lambda _: None)
+    made = CommandStream(config, refused, lambda _: None, lambda tau: tau)
     made.proceed()
     return made
 
