@@ -117,7 +117,7 @@ class Step:
         For one upwards the upper bound is lowered, and else the lower one raised; if they cross,
         the other one follows.
         """
-        lower, upper = np.empty(self.robot.n), np.empty(self.robot.n)
+        lower, upper = np.empty(len(bounds.lower)), np.empty(len(bounds.lower))
         _narrow(self.disturbance, bounds.lower, bounds.upper, lower, upper)
         return AccelerationRange(lower, upper)
 
