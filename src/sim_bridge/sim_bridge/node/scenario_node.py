@@ -44,6 +44,7 @@ from viability_bounds_pkg.ros.program import (
     leave,
     node_parser,
     report_refusal,
+    time_to_leave,
 )
 from viability_bounds_pkg.ros.runtime import make_executor, steady_timer
 
@@ -345,7 +346,8 @@ def main(args: list[str] | None = None) -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         return INTERRUPTED
     finally:
-        leave(*filter(None, [node]))
+        with time_to_leave():
+            leave(*filter(None, [node]))
         if file is not None:
             file.close()
 

@@ -8,7 +8,8 @@ import gc
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 
 import rclpy
@@ -136,6 +137,7 @@ def run_together(
         line on stderr that says why.
     """
     nodes: list[ArmNode] = []
+    executor: Executor | None = None
     told: list[int] = []
 
     def interrupt(number: int, _: object) -> None:
@@ -161,7 +163,9 @@ def run_together(
         # The program is ending: a further signal must not change its exit code.
         for each in (signal.SIGINT, signal.SIGTERM):
             signal.signal(each, lambda *_: None)
-        leave(*nodes)
+        with time_to_leave():
+            leave(*nodes)
+            executor = None  # with it goes what Fast DDS has of the process
         gc.unfreeze()
     return 0
 
@@ -181,18 +185,24 @@ def prepared_executor(nodes: Sequence[ArmNode]) -> Executor:
     return executor
 
 
-def leave(*nodes: Node) -> None:
-    """Destroy nodes and shut ROS down at the end of a process; call it from the main thread.
+@contextmanager
+def time_to_leave() -> Iterator[None]:
+    """Limit the time for leaving ROS at the end of a process; enter it in the main thread.
 
     When another process leaves at the same moment, Fast DDS 2.14 may wait for ever inside a call,
     so that no Python code runs any more. So the system ends the process if this takes too long.
     """
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(_LEAVE_TIMEOUT)
+    yield
+    signal.alarm(0)
+
+
+def leave(*nodes: Node) -> None:
+    """Destroy nodes and shut ROS down."""
     for node in nodes:
         node.destroy_node()
     rclpy.try_shutdown()
-    signal.alarm(0)
 
 
 def report_refusal(error: Exception) -> None:
