@@ -74,6 +74,13 @@ def test_a_publisher_of_something_else_does_not_count_until_their_number_changes
     assert not watch.admits(TOPIC, of_other=True)
     assert watch.admits(TOPIC)
     assert not watch.trouble
+    other = PublisherWatch(ros.probe)  # of a node that does not read the messages itself
+    other.add(TOPIC)
+    other.check()
+    assert other.trouble
+    other.share(watch)
+    other.check()
+    assert not other.trouble
     rival = rival_of(ros)
     ros.wait_until(lambda: not watch.admits(TOPIC), "the rival")
     ros.stop(gripper)

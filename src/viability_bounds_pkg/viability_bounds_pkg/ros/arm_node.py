@@ -181,6 +181,7 @@ def connect(nodes: Sequence[ArmNode]) -> None:
     queue = Queue(nodes[0])
     sources: dict[str, Stream | Input] = {}
     for node in nodes:
+        node.publisher_watch.share(nodes[0].publisher_watch)
         for stream in node.streams:
             stream.queue = queue
             sources[stream.topic_name] = stream

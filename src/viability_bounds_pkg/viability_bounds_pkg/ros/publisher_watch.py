@@ -38,6 +38,10 @@ class PublisherWatch:
         """Watch a topic, too; its name is resolved."""
         self._topics.append(topic)
 
+    def share(self, other: PublisherWatch) -> None:
+        """Know what another node of the process knows: one may read the messages for all."""
+        self._shared = other._shared
+
     @property
     def trouble(self) -> str:
         """Topics with several publishers in words, empty if there is none."""
