@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -19,7 +18,7 @@ from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES
 from viability_bounds_pkg.robot.files import RobotDescriptionError
-from viability_bounds_pkg.ros.messages import stamp_fault
+from viability_bounds_pkg.ros.refusals import RefusalLog, stamp_fault
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 _SHAPES = {Marker.CUBE: "box", Marker.SPHERE: "sphere", Marker.CYLINDER: "cylinder"}
@@ -27,9 +26,6 @@ _REFUSED = (RobotDescriptionError, ObstacleError, ValueError)
 
 AHEAD_MAX = 3600.0
 """Messages with stamps further ahead are of another clock, s: scenarios are sent whole."""
-
-SAME_PERIOD = 1.0
-"""Refusals in a row that differ in numbers only get a line this often, s."""
 
 WAITING_MAX = 10_000
 """So many messages may wait for their time."""
@@ -76,7 +72,7 @@ class WorldSubscriber:
         self._robot, self._now, self._refused = robot, now, refused
         self._wrench_timeout = round(1e9 * wrench_timeout)
         self._pending: list[_Change] = []
-        self._told, self._told_at = "", -math.inf
+        self._refusals = RefusalLog(self._logger.warning)
         self.wrench_ends: dict[str, int] = {}
         for topic, callback in (
             (EXTERNAL_WRENCH, self._on_wrench),
@@ -176,13 +172,9 @@ class WorldSubscriber:
             raise ObstacleError(f"there is no obstacle {name!r}")
 
     def _refuse(self, topic: str, reason: Exception | str) -> None:
-        """Count a refusal; of those in a row that differ in numbers only, one a second is told."""
+        """Count a refusal, and tell it."""
         self._refused[topic] += 1
-        text, now = f"{topic} refused: {reason}", time.monotonic()
-        kind = "".join(each for each in text if not each.isdigit())
-        if kind != self._told or now - self._told_at > SAME_PERIOD:
-            self._told, self._told_at = kind, now
-            self._logger.warning(text)
+        self._refusals.tell(f"{topic} refused: {reason}")
 
 
 def _placed(obstacle: Obstacle, frame: pin.SE3) -> Obstacle:

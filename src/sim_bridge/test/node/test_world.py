@@ -11,9 +11,9 @@ from geometry_msgs.msg import WrenchStamped
 from robot_probe import MODEL, PERIOD, VALUES, Q, RobotProbe
 from visualization_msgs.msg import Marker, MarkerArray
 
-from sim_bridge.node import world_subscriber
 from viability_bounds_pkg.robot.description import inertia_beyond
 from viability_bounds_pkg.robot.files import read_urdf
+from viability_bounds_pkg.ros import refusals
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 
 
@@ -103,7 +103,7 @@ def test_what_is_stamped_by_another_clock_is_refused_with_the_difference(ros, mo
     push = WrenchStamped()
     push.header.frame_id, push.wrench.force.y = "panda_link4", 30.0
     set_stamp(push.header.stamp, time.time_ns())
-    monkeypatch.setattr(world_subscriber, "SAME_PERIOD", math.inf)
+    monkeypatch.setattr(refusals, "SAME_PERIOD", math.inf)
     for _ in range(5):
         ros.talk(WrenchStamped, "external_wrench", GOAL_QOS).publish(push)
     ros.wait_until(lambda: "external_wrench: 5;" in robot.reported("commands_refused"))

@@ -35,6 +35,7 @@ from torque_safety_controller.node import goals
 from torque_safety_controller.node.goal_messages import pose_from_message
 from torque_safety_controller.node.periodic import StateStream
 from torque_safety_controller.qp import AccelerationRange
+from viability_bounds_pkg.ros import refusals
 from viability_bounds_pkg.ros.messages import Arrival
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS, STATUS_QOS
 from viability_bounds_pkg.state import State
@@ -261,7 +262,7 @@ def test_jogs_that_waited_for_the_robot_are_dropped(ros, capfd):
 
 def test_a_goal_that_waits_is_told_and_one_of_another_clock_is_refused(ros, monkeypatch, capfd):
     monkeypatch.setattr(goals, "WAITING_MAX", 2)
-    monkeypatch.setattr(goals, "SAME_PERIOD", math.inf)
+    monkeypatch.setattr(refusals, "SAME_PERIOD", math.inf)
     chain = NodeChain(ros, goal_ahead_max=2.0)
 
     def send(stamp, refused):

@@ -27,7 +27,7 @@ from viability_bounds_pkg.pose_trajectory import (
     TrajectoryPoint,
 )
 from viability_bounds_pkg.robot.configuration import RobotConfiguration
-from viability_bounds_pkg.ros.messages import stamp_fault
+from viability_bounds_pkg.ros.refusals import stamp_fault
 
 Array = NDArray[np.float64]
 

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import math
-import time
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -48,6 +46,7 @@ from torque_safety_controller.node.topics import (
 )
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.refusals import RefusalLog
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import Topic
 from viability_bounds_pkg.state import State, whole_turns
@@ -58,9 +57,6 @@ WAITING_MAX = 1000
 """So many goals may wait for their time."""
 
 _ROUNDING = 1e-9
-
-SAME_PERIOD = 1.0
-"""Refusals in a row that differ in numbers only get a line this often, s."""
 
 NEEDED = {
     TARGET_POSE.name: ("pose_weight", "pose_kp"),
@@ -120,7 +116,7 @@ class GoalSubscriber:
         self._waiting: list[_Waiting] = []
         self._contested: set[str] = set()
         self._unserved: set[str] = set()
-        self._told, self._told_at = "", -math.inf
+        self._refusals = RefusalLog(node.get_logger().warning)
         self._held_up: Motion | None = None
         self.listen(TARGET_POSE, self._on_pose)
         if len(config.end_effectors) > 1:
@@ -188,11 +184,7 @@ class GoalSubscriber:
     def refuse(self, topic: Topic, reason: Exception | str) -> None:
         """Count and log a goal that cannot be followed, or a publisher that cannot be heard."""
         self.refused[topic.name] += 1
-        text, now = f"{topic.name} refused: {reason}", time.monotonic()
-        kind = "".join(each for each in text if not each.isdigit())
-        if kind != self._told or now - self._told_at > SAME_PERIOD:
-            self._told, self._told_at = kind, now
-            self._node.get_logger().warning(text)
+        self._refusals.tell(f"{topic.name} refused: {reason}")
 
     def add(self, topic: Topic, message: Any, apply: Callable[[], None]) -> None:
         """Call `apply` when the time in the header of `message` has come; see `_Waiting`."""

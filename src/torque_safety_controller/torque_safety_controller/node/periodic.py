@@ -22,7 +22,8 @@ from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.plausible import RESTART_GAP, PlausibilityCheck
 from viability_bounds_pkg.robot.gravity import Gravity
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Arrival, JointOrder, JointStateReader, count_refusal
+from viability_bounds_pkg.ros.messages import Arrival, JointOrder, JointStateReader
+from viability_bounds_pkg.ros.refusals import count_refusal
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS
 

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages into arrays and back: names matched, values and stamps checked, refusals counted."""
+"""Messages into arrays and back: names matched, values and stamps checked."""
 
 from __future__ import annotations
 
 import math
-import time
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from enum import Enum
 from typing import NamedTuple
 
@@ -20,11 +19,11 @@ from sensor_msgs.msg import JointState
 from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.plausible import PlausibilityCheck
 from viability_bounds_pkg.robot.gravity import Gravity
+from viability_bounds_pkg.ros.refusals import Warn, count_refusal
 from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
 from viability_bounds_pkg.state import State, whole_turns
 
 Array = NDArray[np.float64]
-Warn = Callable[[str], object]
 
 _PERIODS_SEEN = 20
 """Fewer states do not tell their period."""
@@ -60,38 +59,6 @@ class JointOrder:
         self._names = list(names)
         self.index = slice(None) if index == list(range(len(names))) else np.array(index)
         return "", ""
-
-
-def count_refusal(
-    topic: str, reason: str, detail: str, refused: Counter[str], warn: Warn | None
-) -> None:
-    """Count a dropped message by its reason; warn in words of the first one of each reason."""
-    refused[reason] += 1
-    if warn is not None and refused[reason] == 1:
-        warn(f"{topic} refused: {reason}" + (f": {detail}" if detail else ""))
-
-
-def stamp_fault(stamp: int, now: int, ahead_max: float, late_max: float = math.inf) -> str:
-    """Return why a stamp is none of the robot's clock; empty if it may be. Zero stands for now.
-
-    Args:
-        stamp: of a message, ns.
-        now: stamp of the newest joint state, ns; -1 if there is none.
-        ahead_max: how far it may be ahead, s.
-        late_max: how long ago it may be, s.
-    """
-    apart = 1e-9 * (stamp - now)
-    if not stamp or now < 0 or -late_max <= apart <= ahead_max:
-        return ""
-    far, when = abs(apart), "ahead of" if apart > 0.0 else "before"
-    by = f"{far:.3g}" if far < 1e3 else f"{far:.0f}"
-    of_day = 1e-9 * abs(stamp - time.time_ns())
-    clock = ": it is the wall clock's, the robot has another time" if of_day < 0.1 * far else ""
-    allowed = min(ahead_max, late_max)
-    return (
-        f"header.stamp is {by} s {when} that of the joint states{clock}; allowed: {allowed:g} s, "
-        "or 0"
-    )
 
 
 class Arrival(Enum):
