@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,7 +39,13 @@ class JointLimitsError(ArmSafetyError, ValueError):
 class JointLimits:
     """Position, velocity and acceleration limits of n joints.
 
-    Instances are immutable and compare by identity, so that they can key a cache.
+    Towards a position limit at distance r the speed is limited to
+
+        min(v_max, max(0, sqrt(2 d r) - c)),
+
+    d being `deceleration_limit`, c `velocity_offset`. So a joint stands at a distance of
+    ``c^2 / (2 d)`` at the latest; nearer to the limit it may only move away. Instances are
+    immutable and compare by identity, so that they can key a cache.
 
     Args:
         names: n different, non-empty joint names.
@@ -48,9 +54,13 @@ class JointLimits:
         v_max: shape (n,), rad/s, finite and positive; limits the speed in both directions.
         a_min: shape (n,), rad/s^2, finite and negative.
         a_max: shape (n,), rad/s^2, finite and positive.
+        velocity_offset: shape (n,), rad/s, not negative; zeros if empty.
+        deceleration_limit: shape (n,), rad/s^2, positive; inf, as for all if empty, for a speed
+            limit that does not depend on position.
 
     Raises:
-        JointLimitsError: a value is missing, NaN, of the wrong sign, or out of order.
+        JointLimitsError: a value is missing, NaN, of the wrong sign, or out of order; or the
+            speed limit leaves no place to move.
     """
 
     names: tuple[str, ...]
@@ -59,27 +69,65 @@ class JointLimits:
     v_max: NDArray[np.float64]
     a_min: NDArray[np.float64]
     a_max: NDArray[np.float64]
+    velocity_offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    deceleration_limit: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         names = _checked_names(self.names)
         object.__setattr__(self, "names", names)
-        for field in ("q_min", "q_max", "v_max", "a_min", "a_max"):
-            object.__setattr__(self, field, joint_array(field, getattr(self, field), names))
-        low, high = self.q_min, self.q_max
-        for field, usable, allowed in (
+        for name, none in (("velocity_offset", 0.0), ("deceleration_limit", np.inf)):
+            if np.size(getattr(self, name)) == 0:
+                object.__setattr__(self, name, np.full(len(names), none))
+        for name in (each.name for each in fields(self)[1:]):
+            object.__setattr__(self, name, joint_array(name, getattr(self, name), names))
+        low, high, c, d = self.q_min, self.q_max, self.velocity_offset, self.deceleration_limit
+        with np.errstate(invalid="ignore"):  # of numbers that are refused
+            moves = c * c < d * (high - low)
+        for name, usable, allowed in (
             ("q_min", low < math.inf, "must be finite or -inf"),
             ("q_max", high > -math.inf, "must be finite or inf"),
             ("q_max", low < high, "must be above q_min"),
             ("v_max", _finite(self.v_max), "must be finite and positive"),
             ("a_min", _finite(-self.a_min), "must be finite and negative"),
             ("a_max", _finite(self.a_max), "must be finite and positive"),
+            ("deceleration_limit", d > 0.0, "must be positive, or inf for none"),
+            ("velocity_offset", (c >= 0.0) & (c < math.inf), "must be finite and at least 0"),
+            ("velocity_offset", (c == 0.0) | (d < math.inf), "needs a finite deceleration_limit"),
+            (
+                "velocity_offset",
+                moves,
+                "must be smaller, or deceleration_limit larger: nowhere in the position range "
+                "may the joint move",
+            ),
         ):
             if not usable.all():
                 j = int(np.argmin(usable))
-                raise JointLimitsError(field, names[j], float(getattr(self, field)[j]), allowed)
+                raise JointLimitsError(name, names[j], float(getattr(self, name)[j]), allowed)
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def rest_distance(self) -> NDArray[np.float64]:
+        """Distance to a position limit within which joints may only move away, shape (n,), rad."""
+        distance: NDArray[np.float64] = 0.5 * self.velocity_offset**2 / self.deceleration_limit
+        return distance
+
+    def velocities(self, q: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the lowest and the highest velocity that is allowed at positions `q`.
+
+        Args:
+            q: shape (..., n), rad.
+
+        Returns:
+            Two arrays of the shape of `q`, rad/s.
+        """
+        q, d = np.asarray(q, dtype=np.float64), self.deceleration_limit
+        rooms = np.maximum(np.stack([q - self.q_min, self.q_max - q]), 0.0)
+        with np.errstate(invalid="ignore"):
+            curve = np.maximum(np.sqrt(2.0 * d * rooms) - self.velocity_offset, 0.0)
+        lower, upper = np.where(np.isinf(d), self.v_max, np.minimum(curve, self.v_max))
+        return -lower, upper
 
 
 def joint_array(field: str, values: ArrayLike, names: Sequence[str]) -> NDArray[np.float64]:

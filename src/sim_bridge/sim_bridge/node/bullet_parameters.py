@@ -236,6 +236,8 @@ def make_stop(config: BulletConfiguration) -> CoordinatedStop | None:
             config.velocity_max,
             a_min,
             a_max,
+            config.velocity_offset,
+            config.deceleration_limit,
         )
         return CoordinatedStop(
             model,

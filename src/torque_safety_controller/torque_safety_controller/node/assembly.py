@@ -181,7 +181,14 @@ def _own_bounds(
     if not (len(low) == len(high) == n and np.isfinite(config.velocity_max).all()):
         return None
     limits = JointLimits(
-        config.joints, config.position_min, config.position_max, config.velocity_max, low, high
+        config.joints,
+        config.position_min,
+        config.position_max,
+        config.velocity_max,
+        low,
+        high,
+        config.velocity_offset,
+        config.deceleration_limit,
     )
     margin = MARGIN * np.minimum(-low, high)
     return BoundsSolver(limits, HORIZON * config.dt, margin, period=config.dt).bounds

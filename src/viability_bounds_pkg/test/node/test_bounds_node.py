@@ -40,6 +40,7 @@ LIMITS = JointLimits(
     VALUES["acceleration_min"],
     VALUES["acceleration_max"],
 )
+CURVE = {"velocity_offset": [0.2, 0.1, 0.0], "deceleration_limit": [5.0, 3.0, math.inf]}
 REST = [0.0, 0.0, 0.0]
 # Each joint on its way to its upper limit, braking hard enough for the bounds to be narrow.
 NEAR = [0.96, 1.9, 4.0], [0.6, 0.85, 2.95]
@@ -235,6 +236,11 @@ def test_a_horizon_that_is_too_long_for_the_limits_is_shortened(shared_ros):
         ({"acceleration_drift": [1.0, -1.0, 1.0]}, "acceleration_drift", "-1"),
         ({"position_margin": -1e-3}, "position_margin", "-0.001"),
         ({"torque_max": [1.0]}, "torque_max", "3 numbers"),
+        ({"velocity_offset": [0.1, 0.1, 0.0]}, "deceleration_limit", "as the other is given"),
+        ({"deceleration_limit": [5.0, 5.0, math.inf]}, "velocity_offset", "3 numbers"),
+        (CURVE | {"deceleration_limit": [5.0, 0.0, math.inf]}, "deceleration_limit", "> 0"),
+        (CURVE | {"velocity_offset": [0.1, 0.1, 0.1]}, "velocity_offset", "is .inf"),
+        (CURVE | {"velocity_offset": [9.0, 0.1, 0.0]}, "velocity_offset", "9, 0.1, 0"),
         ({"bounds_dt_factor": math.nan}, "bounds_dt_factor", "nan"),
         ({"missed_deadlines": -1}, "missed_deadlines", "-1; allowed: a whole number"),
         ({"motor_bandwidth": [-1.0, 1.0, 1.0]}, "motor_bandwidth", ">= 0"),

@@ -64,6 +64,8 @@ def limits_of(config: Any) -> JointLimits:
         config.velocity_max,
         config.acceleration_min,
         config.acceleration_max,
+        config.velocity_offset,
+        config.deceleration_limit,
     )
 
 

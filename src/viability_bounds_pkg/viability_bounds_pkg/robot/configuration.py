@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.parameter import (
+    NOT_NEGATIVE,
     POSITIVE,
     Range,
     joint_amounts,
@@ -76,6 +77,18 @@ class RobotConfiguration:
         default=(),
         note="above position_min",
     )
+    velocity_offset: Array = joint_numbers(
+        "c of the speed limit max(0, sqrt(2 d r) - c) at the distance r to a position limit, "
+        "rad/s; none if empty",
+        NOT_NEGATIVE,
+        default=(),
+        note="together with deceleration_limit",
+    )
+    deceleration_limit: Array = joint_numbers(
+        "d of this speed limit, rad/s^2; .inf or empty for none",
+        default=(),
+        note="> 0; together with velocity_offset",
+    )
     torque_max: Array = joint_numbers(
         "torque limits of the motors, N m; those of the URDF if empty", POSITIVE, default=()
     )
@@ -100,6 +113,25 @@ class RobotConfiguration:
             raise SettingError("position_min", low, "numbers below .inf")
         if not (low < high).all():
             raise SettingError("position_max", high, "above position_min everywhere")
+        self._check_speed_limits()
+
+    def _check_speed_limits(self) -> None:
+        """Check the speed limits that depend on position; fill in what stands for none."""
+        n, given = len(self.joints), len(self.velocity_offset)
+        if given != len(self.deceleration_limit):
+            name = "deceleration_limit" if given else "velocity_offset"
+            raise SettingError(name, getattr(self, name), f"{n} numbers, as the other is given")
+        if not given:
+            object.__setattr__(self, "velocity_offset", np.zeros(n))
+            object.__setattr__(self, "deceleration_limit", np.full(n, np.inf))
+        c, d = self.velocity_offset, self.deceleration_limit
+        if not (d > 0.0).all():
+            raise SettingError("deceleration_limit", d, "numbers > 0, or .inf for none")
+        if (np.isinf(d) & (c > 0.0)).any():
+            raise SettingError("velocity_offset", c, "0 where deceleration_limit is .inf")
+        if not (c * c / d < self.position_max - self.position_min).all():
+            allowed = "smaller: somewhere between its position limits each joint must have a speed"
+            raise SettingError("velocity_offset", c, allowed)
 
     def _complete(self) -> None:
         """Fill limits that are not given with those of the URDF."""
