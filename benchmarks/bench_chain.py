@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State -> limits -> command in one process: the real nodes against nodes that only relay.
+"""State -> limits -> command: the real nodes against nodes that only relay.
 
-All chains live in one process on one executor, and are driven in turns by probes, so that what
-differs is the work of the nodes, and the way of messages: from node to node as in `safety_stack`
-("one process"), or by the middleware. Each chain has its own simulated arm, moved outside the
-measured time: the real chain's by its commands, through the demo's goals and into the limits; the
-relays' by gravity compensation. With ``--imperfect`` a further chain has what
-``config/imperfect/`` declares, and the estimator node, with messages by the middleware.
+The chains are driven in turns by probes, so that what differs is the work of the nodes, and the
+way of messages: from node to node as in `safety_stack` ("one process"), by the middleware between
+nodes of this process ("middleware"), or between nodes that have a process each ("processes").
+Each chain has its own simulated arm, moved outside the measured time: the real chain's by its
+commands, through the demo's goals and into the limits; the relays' by gravity compensation. With
+``--imperfect`` a further chain has what ``config/imperfect/`` declares, and the estimator node,
+by the middleware.
 """
 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 import time
 from array import array
@@ -23,6 +25,7 @@ import rclpy
 from chain import load_node_values, load_values
 from geometry_msgs.msg import PoseStamped
 from live_robot import goals
+from rclpy.signals import SignalHandlerOptions
 from relays import RelayCommand, RelayLimits
 from sensor_msgs.msg import JointState
 
@@ -33,14 +36,18 @@ from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.robot.description import build_model
 from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.ros.arm_node import ArmNode, connect
-from viability_bounds_pkg.ros.program import prepared_executor
+from viability_bounds_pkg.ros.program import leave, prepared_executor, spin
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES
+from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import overrides
 
 DT_NS = 1_000_000
-WAYS = ("middleware", "one process")
-START = 20.0
+WAYS = ("processes", "middleware", "one process")
+KINDS = {"real": (BoundsNode, ControllerNode), "relay": (RelayLimits, RelayCommand)}
+PROCESSES = multiprocessing.get_context("spawn")
+PATIENCE = 10.0  # s
+START = 30.0
 """After so long at the latest a chain must answer, s."""
 
 
@@ -91,39 +98,59 @@ def drive(executor: Any, probe: Probe, model: pin.Model, cycles: int) -> list[fl
     return times
 
 
+def make_node(kind: Any, namespace: str, values: dict[str, Any]) -> ArmNode:
+    """Return a node of a chain, for an arm with the parameters `values`."""
+    if kind in KINDS["relay"]:
+        relay: ArmNode = kind(values["joints"], namespace=namespace)
+        return relay
+    patient = {"bounds_timeout": PATIENCE, "state_timeout": PATIENCE}  # while others have a turn
+    own = values | patient | {"rate_hz": 1e9 / DT_NS}
+    given = overrides({name: value for name, value in own.items() if value != []})
+    node: ArmNode = kind(namespace=namespace, parameter_overrides=given)
+    return node
+
+
+def serve(kind: Any, namespace: str, values: dict[str, Any]) -> None:
+    """Run a node in a process of its own until that is told to end."""
+    as_child()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = make_node(kind, namespace, values)
+    spin(prepared_executor([node]), node)
+    leave(node)
+
+
 def make_chains(robot: str, imperfect: bool) -> tuple[dict[str, Probe], list[ArmNode], pin.Model]:
-    """Return the probes by the names of their chains, all other nodes, and the arm's model."""
+    """Return the probes by the names of their chains, the nodes here, and the arm's model."""
     values = load_values(robot)
     joints, urdf = values["joints"], read_urdf(values["robot_description"])
     nodes: list[ArmNode] = []
     probes: dict[str, Probe] = {}
 
-    def add(name: str, chain: list[Any], way: str, namespace: str) -> None:
+    def add(name: str, namespace: str) -> Probe:
         arm = BulletRobot(urdf, joints, physics_dt=DT_NS * 1e-9)
         arm.reset(values["start_positions"], np.zeros(len(joints)))
         probes[name] = Probe(joints, arm, namespace=namespace)
-        if way == "one process":
-            connect([probes[name], *chain])
-        nodes.extend(chain)
-
-    def configured(kind: Any, namespace: str, own: dict[str, Any]) -> ArmNode:
-        own = own | {"bounds_timeout": 1.0, "rate_hz": 1e9 / DT_NS}
-        given = overrides({name: value for name, value in own.items() if value != []})
-        node: ArmNode = kind(namespace=namespace, parameter_overrides=given)
-        return node
+        return probes[name]
 
     for way in WAYS:
-        real, relay = (f"{kind}_{way.replace(' ', '_')}" for kind in ("real", "relay"))
-        kinds = (BoundsNode, ControllerNode)
-        add(f"real, {way}", [configured(kind, real, values) for kind in kinds], way, real)
-        relays = [kind(joints, namespace=relay) for kind in (RelayLimits, RelayCommand)]
-        add(f"relay, {way}", relays, way, relay)
+        for what, kinds in KINDS.items():
+            namespace = f"{what}_{way.replace(' ', '_')}"
+            probe = add(f"{what}, {way}", namespace)
+            if way == "processes":
+                for kind in kinds:
+                    arguments = kind, namespace, values
+                    PROCESSES.Process(target=serve, args=arguments, daemon=True).start()
+                continue
+            chain = [make_node(kind, namespace, values) for kind in kinds]
+            nodes += chain
+            if way == "one process":
+                connect([probe, *chain])
     if imperfect:
         own = load_node_values(robot, f"imperfect/{robot}")
         rotors = {"rotor_inertia": values.get("rotor_inertia", [])}  # the probes' robots have none
-        kinds = (EstimatorNode, BoundsNode, ControllerNode)
-        chain = [configured(kind, "remedies", own[kind.NAME] | rotors) for kind in kinds]
-        add("remedies", chain, "middleware", "remedies")
+        add("remedies", "remedies")
+        for kind in (EstimatorNode, BoundsNode, ControllerNode):
+            nodes.append(make_node(kind, "remedies", own[kind.NAME] | rotors))
     return probes, nodes, build_model(urdf, joints)
 
 
@@ -157,7 +184,7 @@ def main() -> None:
     for name, (median, slow) in found.items():
         lost = int(np.isnan(times[name]).sum())
         print(f"{name:>18}: median {median:7.1f} us, 99% {slow:7.1f} us, lost {lost}")
-    for real, relay in (("one process", "middleware"), *zip(WAYS, WAYS, strict=True)):
+    for real, relay in (("one process", "middleware"), *((way, way) for way in WAYS)):
         median, slow = found[f"real, {real}"] / found[f"relay, {relay}"]
         print(f"real, {real} / relay, {relay}: {median:.2f}, 99% {slow:.2f}")
     if options.imperfect:
