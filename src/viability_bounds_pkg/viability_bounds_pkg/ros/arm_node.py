@@ -8,8 +8,10 @@ from contextlib import contextmanager
 from typing import Any, ClassVar
 
 from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.task import Future
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.given_parameters import given_parameters
@@ -20,6 +22,9 @@ from viability_bounds_pkg.ros.topics import Topic, state_topic
 
 CLOCK_TIMEOUT = 5.0
 """How long ``/clock`` may be silent at start before a node warns, s."""
+
+LOOK_PERIOD = 0.2
+"""After which a program looks whether ROS has been shut down, s."""
 
 _TYPE_PERIOD = 2.0  # s
 
@@ -108,6 +113,13 @@ class ArmNode(Node):
         """Call `callback` with the joint states that the node works on: estimated, or reported."""
         self.uses_estimates = estimated
         self.listen(state_topic(estimated), callback, joints=joints)
+
+    def run_once(self, executor: Executor, ended: Future) -> None:
+        """Run callbacks for a while, at most until `ended` is done.
+
+        A driver whose library waits for the arm replaces it by one control period.
+        """
+        executor.spin_until_future_complete(ended, timeout_sec=LOOK_PERIOD)
 
     def announce(self, joints: Sequence[str], rate: float, what: str) -> None:
         """Log in one line what the node does, for which joints, and the topics that it uses.

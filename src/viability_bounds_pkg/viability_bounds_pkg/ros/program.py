@@ -38,7 +38,7 @@ _LEAVE_TIMEOUT = 5
 """How long a node may take to leave the graph, s."""
 
 
-def spin(executor: Executor, node: Node) -> None:
+def spin(executor: Executor, node: ArmNode) -> None:
     """Run callbacks until the context is shut down or SIGINT or SIGTERM comes.
 
     ``EventsExecutor.spin()`` of rclpy 7.1 runs no callback; a wait without time-out does not see
@@ -48,7 +48,7 @@ def spin(executor: Executor, node: Node) -> None:
 
     Args:
         executor: runs the callbacks.
-        node: one of its nodes.
+        node: one of its nodes, whose `run_once` is called again and again.
     """
     signals: list[int] = []
     for each in (signal.SIGINT, signal.SIGTERM):
@@ -61,7 +61,7 @@ def spin(executor: Executor, node: Node) -> None:
 
     steady_timer(node, SIGNAL_CHECK_PERIOD, end_wait)
     while rclpy.ok(context=node.context) and not told.done():
-        executor.spin_until_future_complete(told, timeout_sec=4 * SIGNAL_CHECK_PERIOD)
+        node.run_once(executor, told)
 
 
 def node_parser(kind: type[ArmNode]) -> Parser:
