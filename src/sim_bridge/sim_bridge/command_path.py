@@ -22,6 +22,7 @@ class CommandPath(Generic[Command]):
         imperfections: which ones there are.
 
     Attributes:
+        delay: periods after which commands act.
         missed: number of commands lost on purpose.
         absent: whether none had come for the last period.
     """
@@ -35,6 +36,7 @@ class CommandPath(Generic[Command]):
         # By the number of the period whose state they answer; None for one that was lost.
         self._sent: dict[int, Command | None] = {}
         self._period = 0  # the next one to be simulated
+        self.delay = given.command_delay
         self._missed_in_row = self._outage_left = self.missed = 0
         self.absent = True
 
@@ -49,7 +51,7 @@ class CommandPath(Generic[Command]):
             Whether it can still act; not if it comes for the second time, either.
         """
         answered = self._period - age
-        if age > self._given.command_delay or answered in self._sent:
+        if age > self.delay or answered in self._sent:
             return False
         missed, in_outage = self._misses_period(), self._in_outage()
         lost = missed or in_outage
@@ -59,7 +61,7 @@ class CommandPath(Generic[Command]):
 
     def due(self) -> Command | None:
         """Return the command that acts in the next period; None if it is absent or was lost."""
-        answered = self._period - self._given.command_delay
+        answered = self._period - self.delay
         self._period += 1
         self.absent = answered not in self._sent
         return self._sent.pop(answered, None)

@@ -21,9 +21,9 @@ from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.sensor import ForceTorqueReading
+from sim_bridge.command_path import CommandPath
 from sim_bridge.hardware import Sensing
 from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot, make_stop
-from sim_bridge.node.commands import CommandStream
 from sim_bridge.node.topics import CLOCK, PAUSE, RECORDED, RESET
 from sim_bridge.node.world_subscriber import WorldSubscriber
 from viability_bounds_pkg.plausible import RESTART_GAP
@@ -31,6 +31,7 @@ from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.robot.gravity import gravity_beyond
 from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.commands import CommandStream
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
 from viability_bounds_pkg.ros.messages import PositionCommand, TorqueCommand, wrench_message
 from viability_bounds_pkg.ros.parameters import NodeParameters
@@ -121,7 +122,11 @@ class BulletNode(ArmNode):
         self._gravity = gravity_beyond(model, config.command_includes_gravity)
         self._not_reported = gravity_beyond(model, config.effort_includes_gravity)
         self._commands = CommandStream(
-            config, self._refused, self.get_logger().warning, self._asked
+            config,
+            self._refused,
+            self.get_logger().warning,
+            self._asked,
+            lambda: CommandPath(config.imperfections),
         )
         self._restart()
         self._make_interface()

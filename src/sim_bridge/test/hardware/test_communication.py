@@ -10,8 +10,8 @@ from robot_probe import JOINTS, PERIOD, VALUES
 from sim_bridge.command_path import CommandPath
 from sim_bridge.hardware import Imperfections
 from sim_bridge.node.bullet_parameters import BulletConfiguration
-from sim_bridge.node.commands import CommandStream
 from viability_bounds_pkg.parameter import read
+from viability_bounds_pkg.ros.commands import CommandStream
 from viability_bounds_pkg.testing.ros_harness import joint_state
 
 
@@ -114,8 +114,9 @@ def refused():
 
 @pytest.fixture
 def stream(refused):
-    config = read(BulletConfiguration, VALUES | {"command_delay": 2})
-    made = CommandStream(config, refused, lambda _: None, lambda tau: tau)
+    config = read(BulletConfiguration, VALUES)
+    path = make(command_delay=2)
+    made = CommandStream(config, refused, lambda _: None, lambda tau: tau, lambda: path)
     made.proceed()
     return made
 

@@ -6,14 +6,13 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
-from sim_bridge.command_path import CommandPath
-from sim_bridge.node.bullet_parameters import BulletConfiguration
 from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.ros.messages import CommandReader, JointCommand, TorqueCommand
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
@@ -26,6 +25,69 @@ _WARNING_PERIOD = 10.0
 """Least time between two warnings that commands have stopped, s."""
 
 
+class Driven(Protocol):
+    """Parameters of a robot that obeys commands."""
+
+    @property
+    def joints(self) -> Sequence[str]:
+        """Names of the n joints."""
+
+    @property
+    def dt(self) -> float:
+        """Control period, s."""
+
+    @property
+    def torque_max(self) -> Array:
+        """Torque limits of the motors, shape (n,), N m."""
+
+    @property
+    def command_timeout(self) -> int:
+        """Control periods for which the last command is held."""
+
+
+class Path(Protocol):
+    """The way of commands to the drives, one in each control period.
+
+    Attributes:
+        absent: whether none had come for the last period.
+        delay: periods after which commands act.
+        missed: number of commands lost on purpose.
+    """
+
+    absent: bool
+    delay: int
+    missed: int
+
+    def send(self, command: JointCommand, age: int = 0) -> bool:
+        """Add a command that answers a state `age` periods old; return whether it can act."""
+
+    def due(self) -> JointCommand | None:
+        """Return the command that acts in the next period; None if there is none."""
+
+
+class DirectPath:
+    """A path on which each command acts in the period of the state that it answers."""
+
+    delay = missed = 0
+
+    def __init__(self) -> None:
+        self._command: JointCommand | None = None
+        self.absent = True
+
+    def send(self, command: JointCommand, age: int = 0) -> bool:
+        """Add the command of this period; return whether it is the first one."""
+        if age or self._command is not None:
+            return False
+        self._command = command
+        return True
+
+    def due(self) -> JointCommand | None:
+        """Return the command of this period, which ends."""
+        command, self._command = self._command, None
+        self.absent = command is None
+        return command
+
+
 class CommandStream:
     """Selects the command that acts in each period; counts missed, late and refused ones.
 
@@ -34,6 +96,7 @@ class CommandStream:
         refused: counts messages that are dropped, by reason.
         warn: logs a warning.
         asked: returns the torque that a command asks the motors for, shape (n,), N m.
+        make_path: makes the way of the commands to the drives.
 
     Attributes:
         acting: the command of the present period; None if the robot stops itself.
@@ -47,13 +110,14 @@ class CommandStream:
 
     def __init__(
         self,
-        config: BulletConfiguration,
+        config: Driven,
         refused: Counter[str],
         warn: Callable[[str], object],
         asked: Callable[[Array], Array],
+        make_path: Callable[[], Path] = DirectPath,
     ) -> None:
         self._config, self._refused, self._asked = config, refused, asked
-        self._warn = warn
+        self._warn, self._make_path = warn, make_path
         self._reader = CommandReader(config.joints, refused, warn)
         self._dt_ns = round(1e9 * config.dt)
         self._warned_at = -math.inf
@@ -62,7 +126,7 @@ class CommandStream:
 
     def restart(self) -> None:
         """Forget all commands, and count anew."""
-        self.path: CommandPath[JointCommand] = CommandPath(self._config.imperfections)
+        self.path = self._make_path()
         self.acting: JointCommand | None = None
         self.commanded = False
         self.missed_in_row = self.missed = self._strays = 0
@@ -92,7 +156,7 @@ class CommandStream:
         age, rest = divmod(stamp - own, self._dt_ns)
         if paused or own <= self._resumed_after:
             return False
-        if rest or not 0 <= age <= self._config.imperfections.command_delay:
+        if rest or not 0 <= age <= self.path.delay:
             self._count_stray(own, stamp)
             return False
         command = self._read(message)
