@@ -17,6 +17,7 @@ from matplotlib.patches import FancyArrowPatch, Rectangle
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = {
     "sim_bridge": "tab:green",
+    "franka_bridge": "tab:red",
     "viability_bounds_pkg": "tab:blue",
     "torque_safety_controller": "tab:orange",
 }

@@ -17,6 +17,8 @@ from pathlib import Path
 import numpy as np
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
+from franka_bridge.node import topics as franka_topics
+from franka_bridge.node.franka_parameters import FrankaConfiguration
 from sim_bridge.node import topics as bullet_topics
 from sim_bridge.node.bullet_parameters import BulletConfiguration
 from sim_bridge.node.viewer_node import ViewerConfiguration
@@ -36,13 +38,15 @@ CONFIGURATIONS = {
     "estimator_node": EstimatorConfiguration,
     "controller_node": ControllerConfiguration,
     "bullet_node": BulletConfiguration,
+    "franka_node": FrankaConfiguration,
     "scenario_node": ScenarioConfiguration,
     "viewer_node": ViewerConfiguration,
     "moveit_node": MoveitConfiguration,
 }
 TABLES = {node: parameter_table(kind) for node, kind in CONFIGURATIONS.items()}
-TOPICS: tuple[Topic, ...] = (*SHARED_TOPICS, *controller_topics.TOPICS, *bullet_topics.TOPICS)
-SERVICES: tuple[OfferedService, ...] = (*controller_topics.SERVICES, *bullet_topics.SERVICES)
+_ROOMS = controller_topics, bullet_topics, franka_topics
+TOPICS: tuple[Topic, ...] = sum((room.TOPICS for room in _ROOMS), SHARED_TOPICS)
+SERVICES: tuple[OfferedService, ...] = sum((room.SERVICES for room in _ROOMS), ())
 _HEAD = "<!-- Made by scripts/make_reference.py: change the tables in the code instead. -->\n"
 _TYPES = {
     float: "double",

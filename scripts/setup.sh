@@ -6,7 +6,7 @@
 #
 # With ROS 2 Jazzy sourced, it makes .venv on top of that (system site packages), keeps the system's
 # NumPy, and adds what is missing. Without, it installs the Jazzy wheels into .venv. Then it builds
-# the three packages with colcon, and compiles what Numba would otherwise compile at the first start
+# the packages with colcon, and compiles what Numba would otherwise compile at the first start
 # of a node. What is done already is not done again. See docs/start/install.md.
 
 _usage() {

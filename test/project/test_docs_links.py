@@ -12,7 +12,7 @@ from sim_bridge.scenario.events import Event
 from sim_bridge.scenario.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = "viability_bounds_pkg|torque_safety_controller|sim_bridge"
+PACKAGES = "viability_bounds_pkg|torque_safety_controller|sim_bridge|franka_bridge"
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("**/*.md")])
 FOLDERS = (
     ".ci",

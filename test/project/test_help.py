@@ -12,9 +12,16 @@ from viability_bounds_pkg.testing.executables import run_to_end
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 SOURCED = {"domain.sh", "environment.sh", "options.sh", "setup.sh"}
+PACKAGES = "viability_bounds_pkg", "torque_safety_controller", "sim_bridge", "franka_bridge"
+EXTRAS = {
+    "moveit_node": ("control_msgs", "apt install ros-jazzy-control-msgs"),
+    "franka_node": ("pylibfranka", "source scripts/setup.sh --franka (Python 3.10 to 3.12)"),
+    "franka_stack": ("pylibfranka", "source scripts/setup.sh --franka (Python 3.10 to 3.12)"),
+}
+"""What some programs need that is not installed by default, and how it is."""
 EXECUTABLES = {
     entry.name: entry
-    for package in ("viability_bounds_pkg", "torque_safety_controller", "sim_bridge")
+    for package in PACKAGES
     for entry in distribution(package).entry_points
     if entry.group == "console_scripts"
 }
@@ -50,13 +57,17 @@ def test_help_of_a_python_script(script, capsys, monkeypatch):
     help_of(module.main, script.name, capsys, monkeypatch)
 
 
-@pytest.mark.parametrize("name", sorted(EXECUTABLES.keys() - {"moveit_node"}))
+@pytest.mark.parametrize("name", sorted(EXECUTABLES.keys() - EXTRAS.keys()))
 def test_help_of_an_executable(name, capsys, monkeypatch):
     help_of(EXECUTABLES[name].load(), name, capsys, monkeypatch)
 
 
-@pytest.mark.skipif(bool(importlib.util.find_spec("control_msgs")), reason="it is installed")
-def test_a_program_says_what_it_needs(capsys):
-    assert EXECUTABLES["moveit_node"].load()() == 1
-    line = "moveit_node: no Python module 'control_msgs': apt install ros-jazzy-control-msgs\n"
-    assert capsys.readouterr().err == line
+@pytest.mark.parametrize("name", EXTRAS)
+def test_a_program_says_what_it_needs(name, capsys, monkeypatch):
+    module, remedy = EXTRAS[name]
+    main = EXECUTABLES[name].load()
+    if importlib.util.find_spec(module):
+        help_of(main, name, capsys, monkeypatch)
+    else:
+        assert main() == 1
+        assert capsys.readouterr().err == f"{name}: no Python module '{module}': {remedy}\n"

@@ -24,6 +24,7 @@ PACKAGES = {
     "viability_bounds_pkg": set(),
     "torque_safety_controller": {"viability_bounds_pkg"},
     "sim_bridge": {"viability_bounds_pkg"},
+    "franka_bridge": {"viability_bounds_pkg"},
 }
 """Which packages each may import."""
 
@@ -164,6 +165,8 @@ KEYS = {name: f"python3-{name}" for name in NAMES.split()} | {"pybullet": "pytho
 KEYLESS = {name: name for name in ("daqp", "viser", "trimesh", "mcap")} | {
     "mcap_ros2": "mcap-ros2-support",
     "array_api_compat": "array-api-compat",
+    "pylibfranka": "pylibfranka",
+    "franky_sim": "franky-sim",
 }
 """Modules without a key of rosdep; a comment tells what to install."""
 

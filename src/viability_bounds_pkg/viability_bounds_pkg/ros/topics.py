@@ -111,7 +111,7 @@ JOINT_STATES = Topic(
     "joint_states",
     JointState,
     CONTROL_QOS,
-    ("bullet_node",),
+    ("bullet_node", "franka_node"),
     ("bounds_node", "controller_node", "estimator_node", "scenario_node"),
     "positions, rad, and velocities, rad/s; `effort` is the motors' torque, N m; any order; "
     "further joints are ignored",
@@ -137,7 +137,7 @@ JOINT_COMMANDS = Topic(
     JointState,
     CONTROL_QOS,
     ("controller_node",),
-    ("bullet_node", "estimator_node", "scenario_node"),
+    ("bullet_node", "franka_node", "estimator_node", "scenario_node"),
     "`effort`, N m; or `position` without effort: position control by the drives",
 )
 FT_WRENCH = Topic(
@@ -154,7 +154,7 @@ PAYLOAD = Topic(
     InertiaStamped,
     GOAL_QOS,
     (USER,),
-    ("controller_node", "estimator_node"),
+    ("controller_node", "estimator_node", "franka_node"),
     "what the arm carries from now on besides its own links: mass, kg, centre, m, and moments "
     "about it, kg m², in the axes of the link `frame_id`; a mass of 0: nothing",
 )
@@ -187,7 +187,7 @@ ROBOT_DESCRIPTION = Topic(
     "robot_description",
     String,
     LATCHED_QOS,
-    ("bullet_node",),
+    ("bullet_node", "franka_node"),
     ("estimator_node", "controller_node", "viewer_node"),
     "the URDF; read at start where the parameter `robot_description` is `topic`",
 )
@@ -195,7 +195,7 @@ DIAGNOSTICS = Topic(
     "/diagnostics",
     DiagnosticArray,
     STATUS_QOS,
-    ("bounds_node", "estimator_node", "controller_node", "bullet_node"),
+    ("bounds_node", "estimator_node", "controller_node", "bullet_node", "franka_node"),
     ("scenario_node", "viewer_node"),
     "mode and reason, refused messages, margins, latency, closest approach; a status has the "
     "name of its node, as `left/bullet_node`",

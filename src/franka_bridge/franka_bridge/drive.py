@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which torques are sent to the robot: those of commands, or of the project's stop law.
+
+In this project a torque is all that a motor gives. The robot adds g(q) of itself and of the load
+that it was told, so what is sent is
+
+    sent = tau - g_told(q),    tau = command + g(q), or command where that includes gravity.
+
+A load that the robot does not know yet is in g, not in g_told: then it is part of what is sent.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.robot.description import frame_id
+from viability_bounds_pkg.robot.gravity import Gravity, gravity_beyond
+from viability_bounds_pkg.robot.payload import Payload
+from viability_bounds_pkg.stop import CoordinatedStop
+
+Array = NDArray[np.float64]
+
+_OBSERVER_TIME = 0.01
+"""Of the stop law's observer, s: measured velocities have noise."""
+
+
+class Drive:
+    """The law of the drives; arrays are of shape (n,), in the order of the joints.
+
+    Args:
+        model: of the arm, with the joints of `limits` in their order.
+        limits: that a stop keeps.
+        tau_max: torque limits, N m.
+        rate_max: of what is sent, N m/s.
+        dt: control period, s.
+        gravity_included, effort_included: whether commands and reported torques include gravity.
+
+    Attributes:
+        stop: the stop law.
+        payload: what the arm carries; `told` is what the robot knows of it.
+        clipped: periods in which torques were not those of the command or law, by limits of
+            torque or torque rate.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        limits: JointLimits,
+        tau_max: Array,
+        rate_max: Array,
+        dt: float,
+        gravity_included: bool,
+        effort_included: bool,
+    ) -> None:
+        known = model.copy()
+        self._model, self._frames = model, model.frames
+        self.payload, self.told = Payload(model), Payload(known)
+        self._gravity: Gravity | None = gravity_beyond(model, gravity_included)
+        self._not_reported = gravity_beyond(model, effort_included)
+        self._added = gravity_beyond(known, False) or (lambda q: np.zeros_like(q))
+        self.stop = CoordinatedStop(model, limits, tau_max, dt, observer_time=_OBSERVER_TIME)
+        self._tau_max, self._step = tau_max, rate_max * dt
+        self.clipped = 0
+        self.start(np.zeros(len(limits)), np.zeros(len(limits)), np.zeros(len(limits)))
+
+    def tell_load(self, flange: str) -> pin.Inertia:
+        """Return the load that the robot is to be told, in the flange's axes; it is told then.
+
+        Only what hangs on the flange's joint can be told.
+        """
+        link, load = self.payload.link, self.payload.inertia
+        at = self._frames[frame_id(self._model, flange)]
+        on = self._frames[frame_id(self._model, link)] if link else at
+        if on.parentJoint != at.parentJoint:
+            link, load = "", pin.Inertia.Zero()
+        self.told.carry(link, load.mass, load.lever, load.inertia)
+        return at.placement.actInv(on.placement.act(load))
+
+    def start(self, q: Array, v: Array, applied: Array) -> None:
+        """Begin with an arm to hold.
+
+        Args:
+            q: positions, rad.
+            v: velocities, rad/s.
+            applied: torques that the robot has as the last ones sent, N m.
+        """
+        self.stop.start(q, v)
+        self._by_law = True
+        self._sent = applied.copy()
+
+    def asked(self, q: Array, command: Array) -> Array:
+        """Return the torque of the motors that a command asks for, N m."""
+        return command if self._gravity is None else command + self._gravity(q)
+
+    def reported(self, q: Array, measured: Array) -> Array:
+        """Return the torques to report of those that the robot measures, N m."""
+        return measured if self._not_reported is None else measured - self._not_reported(q)
+
+    def torque(
+        self, q: Array, v: Array, command: Array | None, held: bool, applied: Array
+    ) -> Array:
+        """Return what to send, N m: finite, within the limits of torque and torque rate.
+
+        Args:
+            q: positions, rad.
+            v: velocities, rad/s.
+            command: torques; None to stop and hold.
+            held: whether the command is one of an earlier period.
+            applied: torques that the robot has as the last ones sent, N m.
+        """
+        law = self.stop
+        if not self._by_law and (command is None or held):
+            law.start(q, v)
+            self._by_law = True
+        if command is None:
+            tau = law.torque(q, v)
+        else:
+            tau = np.clip(self.asked(q, command), -self._tau_max, self._tau_max)
+            if self._by_law:
+                tau = law.follow(q, v, tau)
+                self._by_law = held or not law.returned
+        wanted = tau - self._added(q)
+        # A step from what was sent last, and from what the robot has if that was lost.
+        lowest = np.maximum(np.maximum(self._sent, applied) - self._step, -self._tau_max)
+        highest = np.minimum(np.minimum(self._sent, applied) + self._step, self._tau_max)
+        sent = np.minimum(np.maximum(wanted, lowest), highest)
+        self.clipped += bool((sent != wanted).any())
+        self._sent = np.where(np.isfinite(sent), sent, self._sent)
+        return self._sent

@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Entry points of the package's programs, which import nothing heavy themselves."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from viability_bounds_pkg.cli.ros_program import run_program
+
+_LIBFRANKA = {"pylibfranka": "source scripts/setup.sh --franka (Python 3.10 to 3.12)"}
+
+franka_node = partial(run_program, "franka_bridge.node.franka_node", _LIBFRANKA)
+franka_stack = partial(run_program, "franka_bridge.node.franka_stack", _LIBFRANKA)
