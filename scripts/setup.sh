@@ -11,11 +11,12 @@
 
 _usage() {
     cat <<'USAGE'
-usage: source scripts/setup.sh
+usage: source scripts/setup.sh [--franka]
 
 Makes .venv with what the packages need, builds the packages into install/, compiles what Numba
 compiles, and activates all of it in this shell. What is done already is not done again.
 
+  --franka  installs libfranka, too, and a simulated FR3: see docs/start/franka.md
   PYTHON    the Python to make .venv of (default: python3)
 USAGE
 }
@@ -60,6 +61,13 @@ print(sys._base_executable if sys.prefix == sys.argv[1] else sys.executable)' "$
     if [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ]; then
         _install || return 1
         printf '%s' "$wanted" >"$stamp"
+    fi
+
+    if [ "${1:-}" = --franka ] && [ ! "$venv/.franka" -nt "$root/requirements/franka.txt" ]; then
+        echo "setup: installing libfranka and franky-sim" >&2
+        _pip mujoco || return 1
+        _pip --no-deps -r "$root/requirements/franka.txt" || return 1
+        touch "$venv/.franka"
     fi
 
     # shellcheck disable=SC1091
@@ -205,12 +213,15 @@ if [ -z "${BASH_SOURCE[1]:-}" ] && [[ "${1:-}" =~ ^(-h|--help)$ ]]; then
     return 0 2>/dev/null || exit 0
 fi
 
+_option=
+[ -n "${BASH_SOURCE[1]:-}" ] || _option="${1:-}"
+
 # One at a time: two shells may source this at once.
 exec {_lock}>"$(dirname "${BASH_SOURCE[0]}")/../.setup.lock"
 flock "$_lock"
-_setup
+_setup "$_option"
 _status=$?
 exec {_lock}>&-
 unset -f _usage _setup _packages _install _fetch _pip _explain _install_pybullet _build _compile
-unset _lock
+unset _lock _option
 (exit $_status)
