@@ -69,8 +69,9 @@ def bounds(solver: BoundsSolver, q: Array, v: Array) -> AccelerationBounds:
     table = xp.asarray(table, dtype=q.dtype, device=device(q))
     above, below = _Limit(*table[..., 0]), _Limit(*table[..., 1])
     room_above, room_below = above.position - q, below.position + q
-    high, keeps_high = _bound_towards(xp, room_above, v, above)
-    low, keeps_low = _bound_towards(xp, room_below, -v, below)
+    curved = bool(solver.table["offset"].any())
+    high, keeps_high = _bound_towards(xp, room_above, v, above, curved)
+    low, keeps_low = _bound_towards(xp, room_below, -v, below, curved)
     low = -low
     either = _resolve_conflict(xp, room_above, room_below, v, low, high, above)
     slow = xp.abs(v) - above.velocity_error <= above.v_max * (1.0 + ROUNDING)
@@ -92,31 +93,71 @@ class _Limit(NamedTuple):
     margin: Array
     velocity_error: Array
     tolerance: Array
+    rest: Array
+    offset: Array
+    knee: Array
+    twice_full: Array
+    full_room: Array
 
 
-def _bound_towards(xp: Any, room: Array, v: Array, limit: _Limit) -> tuple[Array, Array]:
-    """Return the largest acceleration that keeps a limit, and whether it can be kept."""
+def _bound_towards(
+    xp: Any, room: Array, v: Array, limit: _Limit, curved: bool
+) -> tuple[Array, Array]:
+    """Return the largest acceleration that keeps a limit, and whether it can be kept.
+
+    `curved`: whether speed limits depend on position.
+    """
     dt = limit.dt
     fastest = v + limit.velocity_error
-    slowest = fastest - 2.0 * limit.velocity_error
-    budget = room - 0.5 * dt * fastest
-    # The largest end-of-step speed w with dt w / 2 + w^2 / (2 B) <= budget.
-    c = limit.twice_braking * xp.clip(budget, 0.0, limit.free)
-    w = xp.minimum(c / (limit.k + xp.sqrt(limit.k * limit.k + c)), limit.v_max)
+    slowest = fastest - 2.0 * limit.velocity_error - ROUNDING * limit.v_max
+    budget, to_limit = room - 0.5 * dt * fastest, room + limit.rest
+    w = xp.minimum(_end_speed(xp, budget, limit, curved), limit.v_max)
     w = xp.where(budget >= limit.free, limit.v_max, w)
     # Stop within the step: eq. (19). Outside, and still leaving: brake.
-    inside = room > 0.0
-    stop = -fastest * (fastest / (2.0 * xp.where(inside, room, 1.0)))
+    inside = to_limit > 0.0
+    stop = -fastest * (fastest / (2.0 * xp.where(inside, to_limit, 1.0)))
     stop = xp.where(inside, stop, limit.low)
     # Outside and on the way back: be on the limit when the step ends.
-    back = (2.0 * budget / dt - fastest) / dt
+    left = budget + limit.rest
+    back = (2.0 * left / dt - fastest) / dt
     a = xp.where(fastest > 0.0, stop, back)
-    a = xp.where(budget >= 0.0, (w - fastest) / dt, a) - limit.margin
+    # Between the last place of rest and the limit: stand when the step ends.
+    a = xp.where(left >= 0.0, -fastest / dt, a)
+    a = xp.where(budget >= 0.0, (w - fastest) / dt, a)
+    if curved:
+        along = _along_speed_limit(xp, room, fastest, limit)
+        a = xp.where((limit.offset > 0.0) & (fastest > 0.0), xp.minimum(a, along), a)
+    a = a - limit.margin
     # Written so that a NaN becomes `high`.
     a = xp.where(a < limit.high, xp.where(a < limit.low, limit.low, a), limit.high)
     room = room + limit.tolerance
-    stops = slowest * slowest <= limit.twice_braking * room
-    return a, xp.where(slowest <= 0.0, room >= 0.0, stops)
+    stops = slowest * (slowest + 2.0 * limit.offset) <= limit.twice_braking * room
+    if curved:
+        full = slowest * slowest <= limit.twice_full * (room - limit.full_room)
+        stops = xp.where(slowest > limit.knee, full, stops)
+    return a, xp.where(slowest <= 0.0, room + limit.rest >= 0.0, stops)
+
+
+def _end_speed(xp: Any, budget: Array, limit: _Limit, curved: bool) -> Array:
+    """Return the largest speed at the end of a step from which the limit can be kept."""
+    c = limit.twice_braking * xp.clip(budget, 0.0, limit.free)
+    w = c / (limit.k + xp.sqrt(limit.k * limit.k + c))
+    if not curved:
+        return w
+    c = limit.twice_full * xp.clip(budget - limit.full_room, 0.0, limit.free)
+    k = 0.25 * limit.twice_full * limit.dt
+    return xp.where(w > limit.knee, c / (k + xp.sqrt(k * k + c)), w)
+
+
+def _along_speed_limit(xp: Any, room: Array, v: Array, limit: _Limit) -> Array:
+    """Return the acceleration with which a joint touches its speed limit within the step."""
+    moves = (v > 0.0) & (limit.offset > 0.0)
+    c, d = xp.where(moves, limit.offset, 1.0), 0.5 * limit.twice_braking
+    v = xp.where(moves, v, 1.0)
+    # More than zero, so that its root has a derivative.
+    slack = xp.clip(2.0 * d * room - v * (v + 2.0 * c), 1e-30, None) / v
+    a = 2.0 * d * v / (slack + 2.0 * (v + c) + xp.sqrt(slack * (slack + 4.0 * c)))
+    return xp.where((v - a * limit.dt) * (d - a) <= a * c, -a, xp.inf)
 
 
 def _resolve_conflict(

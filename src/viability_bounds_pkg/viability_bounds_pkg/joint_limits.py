@@ -123,6 +123,9 @@ class JointLimits:
             Two arrays of the shape of `q`, rad/s.
         """
         q, d = np.asarray(q, dtype=np.float64), self.deceleration_limit
+        if np.isinf(d).all():
+            upper = np.broadcast_to(self.v_max, q.shape)
+            return -upper, upper
         rooms = np.maximum(np.stack([q - self.q_min, self.q_max - q]), 0.0)
         with np.errstate(invalid="ignore"):
             curve = np.maximum(np.sqrt(2.0 * d * rooms) - self.velocity_offset, 0.0)

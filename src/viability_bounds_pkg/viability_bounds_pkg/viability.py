@@ -26,7 +26,12 @@ from viability_bounds_pkg.bounds.discrete_time import (
     checked_step,
     discrete_time,
 )
-from viability_bounds_pkg.bounds.kernel import AccelerationBounds, make_table, solve
+from viability_bounds_pkg.bounds.kernel import (
+    AccelerationBounds,
+    knee_speed,
+    make_table,
+    solve,
+)
 from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError
 
 Array = NDArray[np.float64]
@@ -159,8 +164,16 @@ def viable_velocity_range(q: ArrayLike, limits: JointLimits) -> tuple[Array, Arr
 def _velocity_range(q: Array, limits: JointLimits, braking: Array) -> tuple[Array, Array]:
     """Return the velocities from which the limits are kept with `braking`, shape (n, 2)."""
     above, below = limits.q_max - q, q - limits.q_min
-    with np.errstate(invalid="ignore"):
-        upper = np.minimum(np.sqrt(2.0 * braking[:, 0] * above), limits.v_max)
-        lower = -np.minimum(np.sqrt(2.0 * braking[:, 1] * below), limits.v_max)
+    lowest, highest = limits.velocities(q)
+    c, d, knees = limits.velocity_offset, limits.deceleration_limit, knee_speed(limits, braking)
+
+    def viable(allowed: Array, room: Array, side: int) -> Array:
+        # Above the knee the parabola of full braking, v^2 <= 2 B (room - c^2 / (2 (d - B))).
+        knee = np.where(np.isfinite(knees), knees, 0.0)[:, side]
+        parabola = 2.0 * braking[:, side] * (room - 0.5 * c * (c + knee) / d)
+        slowed = np.minimum(np.sqrt(np.maximum(parabola, 0.0)), allowed)
+        return np.where(allowed > knees[:, side], slowed, allowed)
+
+    upper, lower = viable(highest, above, 0), -viable(-lowest, below, 1)
     outside = (above < 0.0) | (below < 0.0)
     return np.where(outside, np.nan, lower), np.where(outside, np.nan, upper)

@@ -44,7 +44,10 @@ def random_solver(rng):
         v_max, q_max = unit * rng.uniform(0.5, 20.0, N), q_min + length
         q_min[rng.random(N) < 0.1], q_max[rng.random(N) < 0.1] = -np.inf, np.inf
         names = [f"joint_{j}" for j in range(N)]
-        limits = JointLimits(names, q_min, q_max, v_max, a_min, a_max)
+        d, c = unit / dt * rng.uniform(0.2, 3.0, N), rng.uniform(0.0, 0.7, N)
+        d[rng.random(N) < 0.5], c[rng.random(N) < 0.2] = np.inf, 0.0
+        c = np.where(np.isinf(d), 0.0, c * np.sqrt(np.where(np.isinf(d), 0.0, d) * length))
+        limits = JointLimits(names, q_min, q_max, v_max, a_min, a_max, c, d)
         share = rng.choice([0.0, 0.01, 0.1])
         errors = {"position_error": share * length, "velocity_error": share * v_max}
         margin = rng.choice([0.0, 0.1]) * np.minimum(-a_min, a_max)

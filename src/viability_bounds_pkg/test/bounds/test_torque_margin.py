@@ -3,7 +3,8 @@
 
 import numpy as np
 import pytest
-from adversary import advance
+from adversary import advance, too_fast
+from joint_cases import with_curves
 
 from viability_bounds_pkg.bounds.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.joint_limits import JointLimits
@@ -40,15 +41,20 @@ def excess_in_units_of_d(rng, limits, dt, jerk, margins, factor):
         q, v, low, high = advance(q, v, a, dt)
         beyond = np.maximum(high - limits.q_max, limits.q_min - low) + position_error
         excess = max(excess, np.max(beyond / position_error))
-        speed = max(speed, np.max(np.abs(v) + velocity_error - limits.v_max))
+        too_far = q + np.sign(v) * position_error
+        speed = max(speed, np.max(velocity_error + too_fast(limits, too_far, v)))
         q, v = q + position_error * outward, v + dt * mean_error * outward
     return excess, speed
 
 
-@pytest.mark.parametrize(("seed", "factor"), [(0, 1.0), (1, 2.0), (2, 3.3)])
-def test_margins_keep_the_limits_against_the_worst_deviations(seed, factor):
+@pytest.mark.parametrize(
+    ("seed", "factor", "curved"),
+    [(0, 1.0, False), (1, 2.0, False), (2, 3.3, False), (3, 2.0, True)],
+)
+def test_margins_keep_the_limits_against_the_worst_deviations(seed, factor, curved):
     rng = np.random.default_rng(seed)
     limits, dt, jerk = random_case(rng)
+    limits = with_curves(limits, rng) if curved else limits
     excess, speed = excess_in_units_of_d(rng, limits, dt, jerk, torque_margins(jerk, dt), factor)
     assert excess <= -2.0  # in units of the position error of one step
     assert speed <= 1e-12  # rad/s
@@ -97,15 +103,18 @@ def excess_of_held_torques(rng, limits, dt, jerk, held, rule):
                 + t**3 / 3.0 * error
             )
             position = max(position, np.maximum(q_t - limits.q_max, limits.q_min - q_t).max())
-            speed = max(speed, (np.abs(v_t) - limits.v_max).max())
+            speed = max(speed, too_fast(limits, q_t, v_t).max())
         q, v = q_t, v_t
     return position, speed
 
 
-@pytest.mark.parametrize(("seed", "held"), [(0, 2), (1, 3), (2, 9)])
-def test_torques_that_are_held_for_several_periods_keep_the_limits(seed, held):
+@pytest.mark.parametrize(
+    ("seed", "held", "curved"), [(0, 2, False), (1, 3, False), (2, 9, False), (3, 3, True)]
+)
+def test_torques_that_are_held_for_several_periods_keep_the_limits(seed, held, curved):
     rng = np.random.default_rng(seed)
     limits, dt, jerk = random_case(rng)
+    limits = with_curves(limits, rng) if curved else limits
     jerk *= 2.0 / (1.0 + held)
     position, speed = excess_of_held_torques(rng, limits, dt, jerk, held, rule=True)
     assert position <= 1e-12 and speed <= 1e-12

@@ -44,7 +44,7 @@ def test_algorithm_3_breaks_the_limits_where_the_discrete_time_condition_fails(n
         lower, upper = (np.clip(b, limits.a_min, limits.a_max) for b in (lower, upper))
         a = choose(q, v, np.minimum(lower, upper), upper, limits, rng)
         q, v, low, high = advance(q, v, a, dt)
-        seen.see(low, high, v)
+        seen.see(low, high, q, v)
     assert seen.worst > 1e-3 * min(case[2], case[1] - case[0])
 
 
@@ -63,7 +63,7 @@ def test_limits_hold_while_the_step_changes(name, share):
         lower, upper, _ = solvers[rng.integers(4)].bounds(q, v)
         a = choose(q, v, lower, upper, limits, rng) + rng.choice([-w, w], v.shape)
         q, v, low, high = advance(q, v, a, dt)
-        seen.see(low, high, v)
+        seen.see(low, high, q, v)
     assert seen.worst <= VIOLATION
 
 

@@ -41,6 +41,12 @@ def choose(q, v, lower, upper, limits, rng):
     return np.choose(np.arange(len(q))[:, None] % len(ways), ways)
 
 
+def too_fast(limits, q, v):
+    """Return by how much velocities exceed what is allowed at their positions, rad/s."""
+    lowest, highest = limits.velocities(q)
+    return np.maximum(v - highest, lowest - v)
+
+
 class Violations:
     """Largest violations of the limits seen, rad and rad/s; states lost from the kernel."""
 
@@ -49,10 +55,11 @@ class Violations:
         self.position = self.speed = -np.inf
         self.lost = 0
 
-    def see(self, low, high, v):
+    def see(self, low, high, q, v):
+        """Look at the lowest and highest position on the way, and at a state."""
         position = np.maximum(high - self.limits.q_max, self.limits.q_min - low)
         self.position = max(self.position, position.max())
-        self.speed = max(self.speed, (np.abs(v) - self.limits.v_max).max())
+        self.speed = max(self.speed, too_fast(self.limits, q, v).max())
 
     @property
     def worst(self):
@@ -109,7 +116,7 @@ def drive(solver, q, v, steps, rng, shortest=1.0):
         seen.lost += int((~viable).sum())
         a = choose(q, v, lower, upper, solver.limits, rng)
         q, v, low, high = advance(q, v, a, solver.steps * rng.uniform(shortest, 1.0))
-        seen.see(low, high, v)
+        seen.see(low, high, q, v)
     return seen
 
 
@@ -143,6 +150,6 @@ def bring_back(solver, q, v, most_steps, rng):
         position = max(position, np.maximum(high - stop_above, stop_below - low).max())
         speed = max(speed, (np.abs(v) - fastest).max())
         outside = np.maximum(high - limits.q_max, limits.q_min - low)
-        outside = np.maximum(outside, np.abs(v) - limits.v_max)
+        outside = np.maximum(outside, too_fast(limits, q, v))
         again = max(again, outside.max(where=back, initial=-np.inf))
     return Returned(int((~back).sum()), again, position, speed)

@@ -133,7 +133,7 @@ class ImperfectRobot:
         if not lag.any():
             self.q, self.v, low, high = advance(self.q, self.v, command + disturbance, time)
             self.a = command
-            self.seen.see(low, high, self.v)
+            self.seen.see(low, high, self.q, self.v)
             return
         q, v, a = self.q, self.v, self.a
         for t in np.linspace(0.0, time, 5)[1:]:
@@ -142,4 +142,4 @@ class ImperfectRobot:
             self.v = v + t * (command + disturbance) + rest * gone
             self.q = q + t * v + 0.5 * t**2 * (command + disturbance) + rest * (t - lag * gone)
             self.a = command + (a - command) * (1.0 - gone)
-            self.seen.see(self.q, self.q, self.v)
+            self.seen.see(self.q, self.q, self.q, self.v)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joints that the tests of the bounds share: where condition (11) holds, and where it fails."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
@@ -98,3 +100,11 @@ def states_of(case, count, seed):
     q[kind == 0], q[kind == 1] = low, high
     v[kind == 2], v[kind == 3], v[kind == 4] = fastest, -fastest, 0.0
     return column(q), column(v)
+
+
+def with_curves(limits, rng):
+    """Return limits with random speed limits near those of positions; some have no offset."""
+    braking, length = np.minimum(-limits.a_min, limits.a_max), limits.q_max - limits.q_min
+    d = braking * rng.uniform(0.3, 3.0, len(limits))
+    c = np.sqrt(d * length) * rng.choice([0.0, 0.1, 0.3, 0.6], len(limits))
+    return replace(limits, velocity_offset=c, deceleration_limit=d)

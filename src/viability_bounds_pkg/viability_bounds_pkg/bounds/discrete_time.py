@@ -6,11 +6,13 @@ out in `docs/theory/bounds.md`. With B_up, B_lo the decelerations
 that the kernel counts on towards the upper and the lower limit, W the margin, E_q and E_v the
 largest errors of position and velocity, and
 
-    b = B_up + 2 W + 2 E_v / dt,    L = q_max - q_min - 2 E_q - E_v dt,
+    b = B_up + 2 W + 2 E_v / dt,    L = q_max - q_min - c^2 / d - 2 E_q - E_v dt,
 
 it reads, for both ends,
 
-    b dt <= v_max,    L >= dt^2 / 2 b (1 + b / B_lo).
+    b dt <= v_max,    L >= dt^2 / 2 b (1 + 2 c / (d dt) + b / B_lo).
+
+c and d are those of a speed limit that depends on position, c / d = 0 without.
 
 Where it fails, the step is shortened, and then the braking reduced, until it holds.
 """
@@ -61,7 +63,7 @@ class Margins(NamedTuple):
             JointLimitsError: one is negative, or leaves nothing of the limits.
         """
         braking = np.minimum(-limits.a_min, limits.a_max)
-        half = 0.5 * (limits.q_max - limits.q_min)
+        half = 0.5 * (limits.q_max - limits.q_min) - limits.rest_distance
         any_size = np.full(len(limits), np.inf)
         return cls(
             _checked("margin", margin, limits, braking, "min(-a_min, a_max), {:g} rad/s^2"),
@@ -156,10 +158,12 @@ def _largest_braking(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return braking with which (11) holds, and whether it is all there is, less the margin.
 
-    What would make a joint too fast is taken off at first. With z = 2 W + 2 E_v / dt, the position
-    part is then, for equal braking B of both sides and for more of the stronger one, X,
+    What would make a joint too fast is taken off at first. With z = 2 W + 2 E_v / dt, s = 1 + 2 c
+    / (d dt), the position part is then, for equal braking B of both sides and for more of the
+    stronger one, X,
 
-        2 B^2 + (3 z - 2 L / dt^2) B + z^2 <= 0,    (X + z) (1 + (X + z) / B) <= 2 L / dt^2.
+        (s + 1) B^2 + ((s + 2) z - 2 L / dt^2) B + z^2 <= 0,
+        (X + z) (s + (X + z) / B) <= 2 L / dt^2.
 
     Returns:
         Towards the upper and the lower limit, shape (n, 2), rad/s^2, NaN where there is none; and
@@ -168,17 +172,19 @@ def _largest_braking(
     inner = without_position_error(limits, margins.position)
     exists = np.isfinite(np.stack([inner.q_max, inner.q_min], axis=1))
     full = np.stack([-limits.a_min, limits.a_max], axis=1) - margins.acceleration[:, None]
+    full = np.minimum(full, limits.deceleration_limit[:, None])
     spread = margins.acceleration + margins.velocity / dt
-    length = inner.q_max - inner.q_min - dt * margins.velocity
+    length = inner.q_max - inner.q_min - 2.0 * limits.rest_distance - dt * margins.velocity
     with np.errstate(all="ignore"):  # steps of any length
         z, room = 2.0 * spread, 2.0 * length * (1.0 + ROUNDING) / dt / dt
         fastest = limits.v_max * (1.0 + ROUNDING) / dt - z
         b = np.where(exists, np.minimum(full, fastest[:, None]), full)
-        half = room - 3.0 * z
-        most = 0.25 * (half + np.sqrt(half * half - 8.0 * z * z))
+        s = 1.0 + 2.0 * limits.velocity_offset / limits.deceleration_limit / dt
+        half = room - (s + 2.0) * z
+        most = 0.5 * (half + np.sqrt(half * half - 4.0 * (s + 1.0) * z * z)) / (s + 1.0)
         equal = np.minimum(b.min(axis=1), most)
-        possible = (equal > 0.0) & (equal >= 0.5 * z * z / most)
-        stronger = 0.5 * equal * (np.sqrt(1.0 + 4.0 * room / equal) - 1.0) - z
+        possible = (equal > 0.0) & (equal >= z * z / (s + 1.0) / most)
+        stronger = 0.5 * equal * (np.sqrt(s * s + 4.0 * room / equal) - s) - z
     continuous = ~exists.any(axis=1)
     possible = np.where(continuous, spread * dt <= limits.v_max, possible)
     stronger = np.where(continuous, np.inf, np.maximum(equal, stronger))

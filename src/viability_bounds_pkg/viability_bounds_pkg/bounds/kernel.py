@@ -8,7 +8,7 @@ and velocity change sign, `a_min` and `-a_max` change places.
 
 from __future__ import annotations
 
-from math import sqrt
+from math import inf, sqrt
 from sys import float_info
 from typing import NamedTuple
 
@@ -37,21 +37,35 @@ ONE_SIDED_LIMIT = np.dtype(
         ("margin", np.float64),
         ("velocity_error", np.float64),
         ("tolerance", np.float64),
+        ("rest", np.float64),
+        ("offset", np.float64),
+        ("knee", np.float64),
+        ("twice_full", np.float64),
+        ("full_room", np.float64),
     ],
     align=True,
 )
 """One position limit of one joint, as compiled code reads it by name.
 
-- position: of the limit, rad; the room is ``position - q``, for the lower limit ``position + q``.
+- position: where a joint comes to rest at the latest, rad; the room is ``position - q``, for the
+  lower limit ``position + q``.
 - dt: step, s.
-- twice_braking: 2 B, rad/s^2, where B is the deceleration that the kernel counts on.
-- k: B dt / 2, rad/s; not zero even if dt is tiny, so that no room at all does not make 0 / 0.
+- twice_braking: 2 B, rad/s^2, where B is the deceleration that the kernel counts on; 2 d where the
+  speed limit depends on position.
+- k: B dt / 2 + c, rad/s; not zero even if dt is tiny, so that no room at all does not make 0 / 0.
 - free: budget ``room - dt v / 2`` from which on only the speed limit counts, rad.
 - v_max: speed limit, rad/s.
 - low, high: hardest accelerations away from the limit and towards it, rad/s^2.
 - margin: acceleration kept back for disturbances, rad/s^2.
 - velocity_error: by which a velocity may be higher or lower than it is said to be, rad/s.
 - tolerance: room that a state may lack and still count as viable, rad.
+
+Of the speed limit that depends on position, v (v + 2 c) <= 2 d room:
+
+- rest: distance of the position limit itself from `position`, rad; 0 without.
+- offset: c, rad/s; 0 without.
+- knee: speed above which d is more than the braking, rad/s. The kernel is
+  v^2 <= twice_full (room - full_room) there; inf where it is never.
 """
 
 
@@ -83,23 +97,49 @@ def make_table(
         margins: what the bounds must hold for.
     """
     inner = without_position_error(limits, margins.position)
-    position = np.stack([inner.q_max, -inner.q_min], axis=1)
-    v_max = limits.v_max[:, None]
+    v_max, d = limits.v_max[:, None], limits.deceleration_limit[:, None]
+    c, rest = limits.velocity_offset[:, None], limits.rest_distance[:, None]
+    position = np.stack([inner.q_max, -inner.q_min], axis=1) - rest
+    near = np.where(c > 0.0, d, braking)
+    knee = np.where(braking < near, knee_speed(limits, braking), np.inf)
     table = np.zeros(position.shape, dtype=ONE_SIDED_LIMIT)
     table["position"], table["dt"], table["v_max"] = position, steps[:, None], v_max
     table["low"] = np.stack([limits.a_min, -limits.a_max], axis=1)
     table["high"] = np.stack([limits.a_max, -limits.a_min], axis=1)
     table["margin"] = margins.acceleration[:, None]
     table["velocity_error"] = margins.velocity[:, None]
+    table["rest"], table["offset"], table["knee"] = rest, c, knee
+    table["twice_full"] = 2.0 * braking
+    table["full_room"] = 0.5 * c * np.where(np.isfinite(knee), knee, 0.0) / d
     largest = np.abs(np.where(np.isfinite(position), position, 0.0)).max(axis=1, keepdims=True)
     length = position.sum(axis=1, keepdims=True)
-    rounding = ROUNDING * (largest + np.minimum(v_max * v_max / (2.0 * braking), length))
+    stopping = 0.5 * v_max * (v_max + 2.0 * c) / near
+    stopping = np.where(v_max > knee, 0.5 * v_max * v_max / braking + table["full_room"], stopping)
+    rounding = ROUNDING * (largest + np.minimum(stopping, length))
     # A joint counts as inside if it may be.
     table["tolerance"] = rounding + 2.0 * margins.position[:, None]
-    table["twice_braking"] = 2.0 * braking
-    table["k"] = np.maximum(0.5 * braking * table["dt"], _TINY)
-    table["free"] = 0.5 * table["dt"] * v_max + 0.5 * v_max * v_max / braking
+    table["twice_braking"] = 2.0 * near
+    table["k"] = np.maximum(0.5 * near * table["dt"] + c, _TINY)
+    table["free"] = 0.5 * table["dt"] * v_max + stopping
     return table
+
+
+def knee_speed(limits: JointLimits, braking: Array) -> Array:
+    """Return the speed above which the speed limit falls faster than a joint can brake.
+
+    Following it takes a deceleration of d v / (v + c).
+
+    Args:
+        limits: of n joints.
+        braking: towards the upper and the lower limit, shape (n, 2), rad/s^2.
+
+    Returns:
+        Shape (n, 2), rad/s; inf where the braking is enough at every speed.
+    """
+    c, d = limits.velocity_offset[:, None], limits.deceleration_limit[:, None]
+    return np.divide(
+        braking * c, d - braking, out=np.full_like(braking, np.inf), where=braking < d
+    )
 
 
 def solve(q: Array, v: Array, table: NDArray[np.void]) -> AccelerationBounds:
@@ -158,15 +198,19 @@ def _bound_towards(room: float, v: float, limit: np.record) -> tuple[float, bool
     if budget >= limit.free:
         a = (limit.v_max - v) / dt
     elif budget >= 0.0:
-        # The largest end-of-step speed w with dt w / 2 + w^2 / (2 B) <= budget.
-        c = limit.twice_braking * budget
-        a = (min(c / (limit.k + sqrt(limit.k * limit.k + c)), limit.v_max) - v) / dt
+        a = (min(_end_speed(budget, limit), limit.v_max) - v) / dt
+    elif budget + limit.rest >= 0.0:
+        # Between the last place of rest and the limit: stand when the step ends.
+        a = -v / dt
     elif v > 0.0:
         # Stop within the step: eq. (19). Outside, and still leaving: brake.
-        a = -v * (v / (2.0 * room)) if room > 0.0 else limit.low
+        to_limit = room + limit.rest
+        a = -v * (v / (2.0 * to_limit)) if to_limit > 0.0 else limit.low
     else:
         # Outside and on the way back: be on the limit when the step ends.
-        a = (2.0 * budget / dt - v) / dt
+        a = (2.0 * (budget + limit.rest) / dt - v) / dt
+    if limit.offset > 0.0 and v > 0.0:
+        a = min(a, _along_speed_limit(room, v, limit))
     a -= limit.margin
     # Written so that a NaN becomes `high`.
     if not a < limit.high:
@@ -174,8 +218,42 @@ def _bound_towards(room: float, v: float, limit: np.record) -> tuple[float, bool
     elif a < limit.low:
         a = limit.low
     room += limit.tolerance
-    v -= 2.0 * limit.velocity_error
-    return a, room >= 0.0 if v <= 0.0 else v * v <= limit.twice_braking * room
+    v -= 2.0 * limit.velocity_error + ROUNDING * limit.v_max
+    if v <= 0.0:
+        return a, room + limit.rest >= 0.0
+    if v > limit.knee:
+        return a, v * v <= limit.twice_full * (room - limit.full_room)
+    return a, v * (v + 2.0 * limit.offset) <= limit.twice_braking * room
+
+
+@njit(cache=True, error_model="numpy")
+def _end_speed(budget: float, limit: np.record) -> float:
+    """Return the largest speed at the end of a step from which the limit can be kept, rad/s.
+
+    It is the largest w with dt w / 2 + w (w + 2 c) / (2 B) <= budget, or where that is above the
+    knee with the parabola of full braking.
+    """
+    c = limit.twice_braking * budget
+    w = c / (limit.k + sqrt(limit.k * limit.k + c))
+    if w > limit.knee:
+        c = limit.twice_full * (budget - limit.full_room)
+        k = 0.25 * limit.twice_full * limit.dt
+        w = c / (k + sqrt(k * k + c))
+    return w
+
+
+@njit(cache=True, error_model="numpy")
+def _along_speed_limit(room: float, v: float, limit: np.record) -> float:
+    """Return the acceleration with which a joint touches its speed limit within the step.
+
+    It is inf where the step ends before. For v > 0 and c > 0; of a state beyond the speed limit
+    it is the acceleration with which that falls at this speed.
+    """
+    c, d = limit.offset, 0.5 * limit.twice_braking
+    slack = max(2.0 * d * room - v * (v + 2.0 * c), 0.0) / v
+    a = 2.0 * d * v / (slack + 2.0 * (v + c) + sqrt(slack * (slack + 4.0 * c)))
+    # At the touch the speed is a c / (d - a).
+    return -a if (v - a * limit.dt) * (d - a) <= a * c else inf
 
 
 @njit(cache=True, error_model="numpy")

@@ -67,4 +67,7 @@ def tightened(limits: JointLimits, margins: TorqueMargins) -> JointLimits:
         q_min=limits.q_min + margins.position,
         q_max=limits.q_max - margins.position,
         v_max=limits.v_max - margins.velocity,
+        velocity_offset=np.where(
+            np.isfinite(limits.deceleration_limit), limits.velocity_offset + margins.velocity, 0.0
+        ),
     )
