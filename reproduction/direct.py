@@ -66,7 +66,12 @@ class DirectLoop:
         config = self._configuration("bullet_node", BulletConfiguration)
         self.robot = make_robot(config)
         self.robot.monitor = LimitMonitor(
-            config.position_min, config.position_max, config.velocity_max, config.torque_max
+            config.position_min,
+            config.position_max,
+            config.velocity_max,
+            config.torque_max,
+            config.velocity_offset,
+            config.deceleration_limit,
         )
         self.config = config
         self.model = load_model(config, config.urdf)

@@ -122,15 +122,36 @@ class JointLimits:
         Returns:
             Two arrays of the shape of `q`, rad/s.
         """
-        q, d = np.asarray(q, dtype=np.float64), self.deceleration_limit
-        if np.isinf(d).all():
-            upper = np.broadcast_to(self.v_max, q.shape)
-            return -upper, upper
-        rooms = np.maximum(np.stack([q - self.q_min, self.q_max - q]), 0.0)
-        with np.errstate(invalid="ignore"):
-            curve = np.maximum(np.sqrt(2.0 * d * rooms) - self.velocity_offset, 0.0)
-        lower, upper = np.where(np.isinf(d), self.v_max, np.minimum(curve, self.v_max))
+        rooms = np.stack([q - self.q_min, self.q_max - q])
+        lower, upper = speed_limits(
+            rooms, self.v_max, self.velocity_offset, self.deceleration_limit
+        )
         return -lower, upper
+
+
+def speed_limits(
+    rooms: NDArray[np.float64],
+    v_max: NDArray[np.float64],
+    velocity_offset: NDArray[np.float64],
+    deceleration_limit: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the speed limits at distances to a position limit.
+
+    Args:
+        rooms: the distances, shape (..., n), rad.
+        v_max: shape (n,), rad/s.
+        velocity_offset: as in `JointLimits`, shape (n,), rad/s.
+        deceleration_limit: as in `JointLimits`, shape (n,), rad/s^2.
+
+    Returns:
+        Shape (..., n), rad/s.
+    """
+    none = np.isinf(deceleration_limit)
+    if none.all():
+        return np.broadcast_to(v_max, rooms.shape)
+    with np.errstate(invalid="ignore"):
+        curve = np.sqrt(2.0 * deceleration_limit * np.maximum(rooms, 0.0)) - velocity_offset
+    return np.where(none, v_max, np.minimum(np.maximum(curve, 0.0), v_max))
 
 
 def joint_array(field: str, values: ArrayLike, names: Sequence[str]) -> NDArray[np.float64]:

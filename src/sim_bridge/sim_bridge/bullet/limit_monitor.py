@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from viability_bounds_pkg.joint_limits import speed_limits
+
 Array = NDArray[np.float64]
 
 _TORQUE_ROUNDING = 1e-9
@@ -27,14 +29,26 @@ class LimitMonitor:
         q_max: upper position limits, shape (n,), rad; may be inf.
         v_max: velocity limits, shape (n,), rad/s.
         tau_max: torque limits, shape (n,), N m.
+        velocity_offset: of speed limits that depend on position, as `JointLimits` has them, shape
+            (n,), rad/s; zeros if not given.
+        deceleration_limit: of the same, shape (n,), rad/s^2; none if not given.
     """
 
     def __init__(
-        self, q_min: ArrayLike, q_max: ArrayLike, v_max: ArrayLike, tau_max: ArrayLike
+        self,
+        q_min: ArrayLike,
+        q_max: ArrayLike,
+        v_max: ArrayLike,
+        tau_max: ArrayLike,
+        velocity_offset: ArrayLike = 0.0,
+        deceleration_limit: ArrayLike = np.inf,
     ) -> None:
         self._q_min, self._q_max, self._v_max, self._tau_max = np.array(
             (q_min, q_max, v_max, tau_max), dtype=float
         )
+        self._curve = np.array(velocity_offset), np.array(deceleration_limit)
+        self._depends_on_q = bool(np.isfinite(self._curve[1]).any())
+        self._too_fast: Array = np.empty_like(self._v_max)
         # q, v, tau, and the same negated: one maximum serves the limits on both sides.
         self._sample = np.empty((2, 3, self._q_min.size))
         self._peak: Array = np.empty_like(self._sample)
@@ -43,6 +57,7 @@ class LimitMonitor:
     def reset(self) -> None:
         """Forget all updates."""
         self._peak.fill(-np.inf)
+        self._too_fast.fill(-np.inf)
 
     def update(self, q: Array, v: Array, tau: Array) -> None:
         """Take one physics step into account.
@@ -59,6 +74,10 @@ class LimitMonitor:
         values[2] = tau
         np.negative(values, out=sample[1])
         np.maximum(self._peak, sample, out=self._peak)  # a NaN stays
+        if self._depends_on_q:
+            room = np.where(v > 0.0, self._q_max - q, q - self._q_min)
+            excess = np.abs(v) - speed_limits(room, self._v_max, *self._curve)
+            np.maximum(self._too_fast, excess, out=self._too_fast)
 
     @property
     def violated(self) -> bool:
@@ -96,7 +115,7 @@ class LimitMonitor:
     @property
     def max_velocity_violation(self) -> Array:
         """Greatest excess of speed, shape (n,), rad/s; 0 where never violated."""
-        excess: Array = np.maximum(self.max_speed - self._v_max, 0.0)
+        excess: Array = np.maximum(np.maximum(self.max_speed - self._v_max, self._too_fast), 0.0)
         return excess
 
     @property

@@ -151,7 +151,12 @@ def record(
         v: velocities there, shape (N, n), rad/s.
     """
     monitor = LimitMonitor(
-        config.position_min, config.position_max, config.velocity_max, config.torque_max
+        config.position_min,
+        config.position_max,
+        config.velocity_max,
+        config.torque_max,
+        config.velocity_offset,
+        config.deceleration_limit,
     )
     robot.monitor = monitor
     robot.reset(q[0], np.zeros(q.shape[1]))

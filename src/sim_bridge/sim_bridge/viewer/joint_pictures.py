@@ -75,7 +75,8 @@ def usage(values: JointValues, limits: JointLimits, tau_max: Array) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         speed = values.v / np.where(values.v < 0.0, lowest, highest)
         torque = np.abs(values.tau) / tau_max
-    speed = np.where(inside < _NEAR, 1.0, np.nan_to_num(speed, nan=0.0, posinf=np.inf))
+    at_limit = inside - limits.rest_distance < _NEAR
+    speed = np.where(at_limit, 1.0, np.nan_to_num(speed, nan=0.0, posinf=np.inf))
     return np.asarray(np.maximum(speed, np.nan_to_num(torque)))
 
 
@@ -109,7 +110,7 @@ class JointPictures:
     ) -> None:
         self._joints, self._limits, self._tau_max = tuple(joints), limits, tau_max
         self._units = units or ("rad",) * len(self._joints)
-        self._kernels = _kernels(limits)
+        self._borders = _borders(limits)
 
     def draw(self, values: JointValues) -> str:
         """Return the picture of all joints as one SVG element."""
@@ -146,7 +147,9 @@ class JointPictures:
             return " ".join("{:.1f},{:.1f}".format(*place(*state)) for state in states)
 
         box = [(low, v_max), (high, v_max), (high, -v_max), (low, -v_max)]
-        kernel = self._kernels[k]
+        allowed, kernel = box, box
+        if (borders := self._borders[k]) is not None:
+            allowed, kernel = borders
         across, down = place(q, v)
         name = escape(self._joints[k])
         distance = min(q - float(limits.q_min[k]), float(limits.q_max[k]) - q)
@@ -162,9 +165,9 @@ class JointPictures:
             f'{small} text-anchor="middle">speed</text>',
             f'<text x="{left + width}" y="{_WORDS_BELOW}" font-size="9" fill="{fill}" '
             f'text-anchor="end">{room}</text>',
-            f'<polygon points="{points(box)}" fill="#f4f4f4" stroke="#888"/>',
-            f'<polygon points="{points(kernel if kernel is not None else box)}" fill="#cfe3f5" '
-            'stroke="#3b76af" stroke-width="0.8"/>',
+            f'<polygon points="{points(allowed)}" fill="#f4f4f4" stroke="#888"/>',
+            f'<polygon points="{points(kernel)}" fill="#cfe3f5" stroke="#3b76af" '
+            'stroke-width="0.8"/>',
             f'<circle cx="{across:.1f}" cy="{down:.1f}" r="3.6" fill="{fill}" stroke="#222"/>',
             *self._bar(_BARS[0], "τ", float(self._tau_max[k]), float(values.tau[k])),
             *self._bar(
@@ -208,13 +211,21 @@ class JointPictures:
         return parts
 
 
-def _kernels(limits: JointLimits) -> list[Array | None]:
-    """Return the borders of the joints' kernels, shape (m, 2), rad and rad/s; None if endless."""
+def _borders(limits: JointLimits) -> list[Array | None]:
+    """Return the borders of what is allowed and of the kernel of each joint.
+
+    Returns:
+        Of each joint shape (2, m, 2), rad and rad/s; None where it is endless.
+    """
     finite = np.isfinite(limits.q_min) & np.isfinite(limits.q_max)
     low, high = np.where(finite, limits.q_min, 0.0), np.where(finite, limits.q_max, 0.0)
     # Positions are dense where the border is steep.
     spread = np.sin(np.linspace(-0.5, 0.5, 61) * np.pi)[:, None]
     q = np.clip(0.5 * (low + high) + 0.5 * (high - low) * spread, low, high)
-    slowest, fastest = viable_velocity_range(q, limits)
-    borders = np.stack([np.r_[q, q[::-1]], np.r_[fastest, slowest[::-1]]], axis=-1)
-    return [borders[:, k] if finite[k] else None for k in range(finite.size)]
+    borders = np.stack(
+        [
+            np.stack([np.r_[q, q[::-1]], np.r_[fastest, slowest[::-1]]], axis=-1)
+            for slowest, fastest in (limits.velocities(q), viable_velocity_range(q, limits))
+        ]
+    )
+    return [borders[:, :, k] if finite[k] else None for k in range(finite.size)]

@@ -56,3 +56,23 @@ def test_a_violation_is_measured_and_kept_until_a_reset(monitor, row, values, na
 def test_a_torque_may_exceed_its_limit_by_rounding(monitor):
     monitor.update(*sample(2, [10.0 * (1.0 + 1e-10), 0.0]))
     assert not monitor.violated
+
+
+@pytest.mark.parametrize(
+    ("q", "v", "excess"),
+    [
+        (1.9, 0.6, 0.1),  # up to sqrt(2 * 5 * 0.1) - 0.5 rad/s, 0.1 rad before the limit
+        (-0.9, -0.6, 0.1),
+        (1.9, -2.0, 0.0),  # away from it
+        (1.98, 0.1, 0.1),  # not at all there
+        (0.5, 3.5, 0.5),
+        (0.5, NAN, NAN),
+    ],
+)
+def test_speeds_are_compared_with_the_limits_at_their_positions(q, v, excess):
+    limits = [-1.0, -INF], [2.0, INF], [3.0, 4.0], [10.0, 20.0]
+    monitor = LimitMonitor(*limits, [0.5, 0.0], [5.0, INF])
+    monitor.update(np.array([q, 9.0]), np.array([v, -4.0]), np.zeros(2))
+    monitor.update(*INSIDE)
+    np.testing.assert_allclose(monitor.max_velocity_violation, [excess, 0.0], atol=1e-12)
+    assert monitor.violated == (excess != 0.0)

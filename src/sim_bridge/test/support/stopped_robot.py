@@ -31,7 +31,12 @@ class Stopped:
         self.robot = make_robot(config)
         self.law = make_stop(config)
         self.robot.monitor = LimitMonitor(
-            config.position_min, config.position_max, config.velocity_max, config.torque_max
+            config.position_min,
+            config.position_max,
+            config.velocity_max,
+            config.torque_max,
+            config.velocity_offset,
+            config.deceleration_limit,
         )
         self.n = len(config.joints)
         self.dt = config.dt / config.substeps

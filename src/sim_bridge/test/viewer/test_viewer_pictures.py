@@ -2,6 +2,7 @@
 """What the viewer draws: joints with their limits, and the robot's shapes."""
 
 import math
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -83,6 +84,22 @@ def test_the_state_on_the_border_is_drawn_on_the_border():
     assert float(dot.get("cy")) == pytest.approx(points[:, 1].min())
     middle = 0.5 * (points[:, 0].min() + points[:, 0].max())
     assert float(dot.get("cx")) == pytest.approx(middle, abs=0.1)
+
+
+def test_speed_limits_that_depend_on_position_are_drawn():
+    c, d = np.array([0.5, 0.0, 0.0]), np.array([4.0, math.inf, math.inf])
+    limits = replace(LIMITS, velocity_offset=c, deceleration_limit=d)
+    root = ElementTree.fromstring(JointPictures(LIMITS.names, limits, TAU_MAX).draw(values()))
+    allowed, kernel, others = list(root.iter(f"{SVG}polygon"))[:3]
+    assert allowed.get("points") == kernel.get("points")  # it can brake as fast as that
+    assert allowed.get("points") != others.get("points")
+    points = np.array([point.split(",") for point in allowed.get("points").split()], dtype=float)
+    at_limit = points[points[:, 0] == points[:, 0].max()]
+    assert np.ptp(at_limit[:, 1]) < 0.51 * np.ptp(points[:, 1]), "only speeds away from it"
+    # c^2 / (2 d) before the limit it is at its end.
+    last = 1.0 - 0.25 / 8.0
+    assert usage(values((last, 0.0, 0.0)), limits, TAU_MAX).tolist() == [1.0, 0.0, 0.0]
+    assert usage(values((last - 0.1, 0.0, 0.0)), limits, TAU_MAX).tolist() == [0.0, 0.0, 0.0]
 
 
 URDF = """<robot name="two">

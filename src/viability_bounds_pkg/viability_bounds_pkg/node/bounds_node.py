@@ -134,10 +134,12 @@ class BoundsNode(ArmNode):
         config, reader = self._node_parameters.configuration, self._reader
         tau = reader.effort()
         distances = np.minimum(reader.q - config.position_min, config.position_max - reader.q)
+        lowest, highest = config.limits.velocities(reader.q)
+        slower = np.minimum(reader.v - lowest, highest - reader.v)
         message = JointState(
             name=list(config.joints),
             position=array("d", distances.tobytes()),
-            velocity=array("d", (config.velocity_max - np.abs(reader.v)).tobytes()),
+            velocity=array("d", slower.tobytes()),
         )
         if tau is not None and len(config.torque_max) and config.effort_includes_gravity:
             message.effort = array("d", (config.torque_max - np.abs(tau)).tobytes())
