@@ -55,6 +55,7 @@ class DirectLoop:
     Attributes:
         robot: in PyBullet.
         controller: with its goals at the start pose.
+        declared: of the robot, for the bounds node.
         bounds: of the accelerations in a state (q, v).
         samples: one a control step.
         sensing: whether the force/torque sensor says anything.
@@ -75,7 +76,7 @@ class DirectLoop:
         )
         self.config = config
         self.model = load_model(config, config.urdf)
-        bounds = self._configuration("bounds_node", BoundsConfiguration)
+        bounds = self.declared = self._configuration("bounds_node", BoundsConfiguration)
         self.limits = bounds.limits
         self.bounds = make_bounds(bounds)
         self.controller, *_ = assembly.make_controller(

@@ -17,9 +17,6 @@ accidents, however long."""
 class KeptRate:
     """Counts states and answers; tells once, in words, when many states are not answered.
 
-    Where no state follows the one before within a period, the robot has another rate: that is
-    nothing to tell here.
-
     Args:
         dt: control period, s.
         covered: longest row of states without an answer that the bounds hold for.
@@ -29,28 +26,28 @@ class KeptRate:
     def __init__(self, dt: float, covered: int, warn: Callable[[str], object]) -> None:
         self._dt, self._covered, self._warn = dt, covered, warn
         self._told = False
-        self._begin()
-
-    def _begin(self) -> None:
-        self._periods = self._answers = self._late = self._longest = 0
+        self._rows: list[int] = []
+        self._periods = 0
 
     def add(self, row: int) -> None:
         """Count an answer after a row of states without one."""
+        if self._told:
+            return
+        self._rows.append(row)
         self._periods += row + 1
-        self._answers += 1
-        self._late += row > 0
-        self._longest = max(self._longest, row)
-        if self._periods * self._dt >= WINDOW:
-            if not self._told and OFTEN * self._answers < self._late < self._answers:
-                self._told = True
-                self._warn(self._line())
-            self._begin()
+        if self._periods * self._dt < WINDOW:
+            return
+        if self._rows.count(0) < (1.0 - OFTEN) * len(self._rows):
+            self._told = True
+            self._warn(self._line())
+        self._rows, self._periods = [], 0
 
     def _line(self) -> str:
-        rate, share = 1.0 / self._dt, self._answers / self._periods
-        slower = rate / math.ceil(1.0 / share)
-        line = f"keeps {share * rate:.0f} of {rate:g} Hz here: set rate_hz to {slower:.4g}"
-        line += " (and the robot's)"
-        if self._longest > self._covered:
-            line += f", or missed_deadlines to {self._longest}"
-        return line
+        """Return the rate that is kept, and one at which the bounds cover the rows."""
+        rate, kept = 1.0 / self._dt, len(self._rows) / self._periods
+        longest = sorted(self._rows)[-2:][0]  # but for one accident
+        slower = rate / max(math.ceil(1.0 / kept), (longest + 1) / (self._covered + 1))
+        return (
+            f"keeps {kept * rate:.0f} of {rate:g} Hz here: set rate_hz to {slower:.3g} "
+            "(and the robot's)"
+        )

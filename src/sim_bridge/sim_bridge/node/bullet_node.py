@@ -413,12 +413,11 @@ class BulletNode(ArmNode):
     def _compare_rate(self) -> None:
         """Tell, once after the start, where the machine simulates fewer periods than it should."""
         self._compared = True
-        rate, due = self._config.rate_hz, self._periods + self._late
-        if self._periods < SLOW * due:
-            slower = rate / math.ceil(due / self._periods)
+        rate, share = self._config.rate_hz, self._periods / (self._periods + self._late)
+        if share < SLOW:
             self.get_logger().warning(
-                f"the simulation keeps {rate * self._periods / due:.0f} of {rate:g} Hz here: set "
-                f"rate_hz of all nodes to {slower:.4g}, or clock to lockstep"
+                f"the simulation keeps {share * rate:.0f} of {rate:g} Hz here: set rate_hz of all "
+                "nodes to less than that, or clock to lockstep"
             )
 
     def destroy_node(self) -> None:

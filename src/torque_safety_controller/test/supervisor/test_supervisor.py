@@ -143,10 +143,10 @@ def test_rows_of_missed_states_are_counted_and_told_once():
     ("rows", "line"),
     [
         ((0, 1), "keeps 67 of 100 Hz here: set rate_hz to 50 (and the robot's)"),
-        ((0, 1, 1, 5), "keeps 37 of 100 Hz here: set rate_hz to 33.33 (and the robot's), or "
-         "missed_deadlines to 5"),
+        ((0, 1, 1, 5), "keeps 37 of 100 Hz here: set rate_hz to 33.3 (and the robot's)"),
+        ((0, 0, 0, 9), "keeps 31 of 100 Hz here: set rate_hz to 20 (and the robot's)"),
+        ((1,), "keeps 50 of 100 Hz here: set rate_hz to 50 (and the robot's)"),
         ((0,), ""),
-        ((1,), ""),  # the robot has another rate
         ((0,) * 99 + (15,), ""),  # accidents
     ],
 )  # fmt: skip

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -22,7 +21,7 @@ Array = NDArray[np.float64]
 _STRAYS = 50
 """Commands in a row for other periods after which a warning is logged."""
 _WARNING_PERIOD = 10.0
-"""Least time between two warnings that commands have stopped, s."""
+"""Least time between two warnings of a kind, s."""
 
 
 class Driven(Protocol):
@@ -94,7 +93,7 @@ class CommandStream:
     Args:
         config: of the robot.
         refused: counts messages that are dropped, by reason.
-        warn: logs a warning.
+        warn: logs a warning, as a logger of rclpy does.
         asked: returns the torque that a command asks the motors for, shape (n,), N m.
         make_path: makes the way of the commands to the drives.
 
@@ -112,7 +111,7 @@ class CommandStream:
         self,
         config: Driven,
         refused: Counter[str],
-        warn: Callable[[str], object],
+        warn: Callable[..., object],
         asked: Callable[[Array], Array],
         make_path: Callable[[], Path] = DirectPath,
     ) -> None:
@@ -120,7 +119,6 @@ class CommandStream:
         self._warn, self._make_path = warn, make_path
         self._reader = CommandReader(config.joints, refused, warn)
         self._dt_ns = round(1e9 * config.dt)
-        self._warned_at = -math.inf
         self._resumed_after = -1
         self.restart()
 
@@ -180,15 +178,10 @@ class CommandStream:
             self.missed_in_row += 1
             if self.missed_in_row > self._config.command_timeout:
                 self.acting = None
-                self._warn_of_silence()
-
-    def _warn_of_silence(self) -> None:
-        now = time.monotonic()
-        if now - self._warned_at > _WARNING_PERIOD:
-            self._warned_at = now
-            self._warn(
-                f"no command for {self.missed_in_row} periods: stopping until they are back"
-            )
+                self._warn(
+                    f"no command for {self.missed_in_row} periods: stopping until they are back",
+                    throttle_duration_sec=_WARNING_PERIOD,
+                )
 
     def _read(self, message: JointState) -> JointCommand | None:
         command = self._reader.read(message)
@@ -205,5 +198,6 @@ class CommandStream:
             self._warn(
                 f"joint_commands refused: {_STRAYS} in a row do not have the stamp of the present "
                 f"joint state; the last one has {1e-9 * own:.13g} s instead of "
-                f"{1e-9 * stamp:.13g} s"
+                f"{1e-9 * stamp:.13g} s",
+                throttle_duration_sec=_WARNING_PERIOD,
             )
