@@ -269,7 +269,9 @@ class CoordinatedStop:
         at_once = speed / self._dt
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.where(room > 0.0, 0.5 * v * v / room, at_once)
-        needed = RESERVE * np.maximum(needed, (speed - limits.v_max) / self._dt)
+        lowest, highest = limits.velocities(q)
+        allowed = np.where(v > 0.0, highest, -lowest)
+        needed = RESERVE * np.maximum(needed, (speed - allowed) / self._dt)
         most = self._braking(v)
         braking = np.minimum(np.minimum(needed, HARDER * most), at_once)
         harder = np.where(v > 0.0, np.minimum(a, -braking), np.maximum(a, braking))
@@ -293,9 +295,12 @@ class CoordinatedStop:
         return -v * np.maximum(self._clearing(q, v), 1.0 / max(self.time_to_rest(v), self._dt))
 
     def _clearing(self, q: Array, v: Array) -> Array:
-        """Return braking by which joints come to rest before `HOLD_CLEARANCE`, per speed, 1/s."""
+        """Return braking by which joints come to rest before `HOLD_CLEARANCE`, per speed, 1/s.
+
+        It is that of the place where the speed limit lets them rest at the latest.
+        """
         speed = np.abs(v)
-        room = np.where(v > 0.0, self._highest - q, q - self._lowest)
+        room = np.where(v > 0.0, self._highest - q, q - self._lowest) - self._limits.rest_distance
         at_once = np.where(speed > REST_SPEED, 1.0 / self._dt, 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.minimum(np.where(room > 0.0, 0.5 * speed / room, np.inf), at_once)

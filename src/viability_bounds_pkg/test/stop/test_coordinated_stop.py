@@ -67,6 +67,22 @@ def test_no_limit_is_passed_from_the_edge_of_the_kernel(arm):
         assert stop.at_rest
 
 
+@pytest.mark.parametrize("share", [0.5, 1.5], ids=["braking enough", "too little"])
+def test_speed_limits_that_depend_on_position_are_kept(share):
+    arm = Arm("panda", (0.15, share))
+    stop, rng, nearest = arm.stop(), np.random.default_rng(3), np.inf
+    for _ in range(5):
+        q, v = arm.edge(rng)
+        stop.start(q, v)
+        steps = round((stop.time_to_rest(v) + FEW_STEPS) / H)
+        for _ in range(steps):
+            q, v = arm.move(q, v, stop.torque(q, v))
+            lowest, highest = arm.limits.velocities(q)
+            nearest = min(nearest, (highest - v).min(), (v - lowest).min())
+        assert stop.at_rest
+    assert 0.0 <= nearest < 0.01  # rad/s
+
+
 def test_joints_come_to_rest_clear_of_their_limits_where_they_can(panda):
     """Where friction holds them they stay there, and what lets them slip takes them no further."""
     stop, limits, clearance = panda.stop(), panda.limits, 4e-4

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """An arm of a parameter file with its stop, and its motion under held torques."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 from true_arm import runge_kutta
@@ -17,17 +19,24 @@ W = 0.05  # largest error of accelerations, in the limits, docs/theory/whole_arm
 
 
 class Arm:
-    """A robot of a parameter file, its stop, and random states."""
+    """A robot of a parameter file, its stop, and random states.
 
-    def __init__(self, robot):
+    With `curve` its speed limits depend on position: those are offset and deceleration limit as
+    shares of speed and braking.
+    """
+
+    def __init__(self, robot, curve=None):
         values = read_config(robot, "bullet_node")
         self.model = read_robot(config_folder() / f"{robot}.yaml").model
         self.data = self.model.createData()
         keys = ("position_min", "position_max", "velocity_max")
         keys = (*keys, "acceleration_min", "acceleration_max")
         self.limits = JointLimits(values["joints"], *(np.array(values[key]) for key in keys))
-        self.tau_max = np.array(values["torque_max"])
         self.margin = W * np.minimum(-self.limits.a_min, self.limits.a_max)
+        if curve is not None:
+            c, d = curve[0] * self.limits.v_max, curve[1] * self.margin / W
+            self.limits = replace(self.limits, velocity_offset=c, deceleration_limit=d)
+        self.tau_max = np.array(values["torque_max"])
         self.n = len(self.limits)
         self.solver = BoundsSolver(self.limits, H, self.margin)
 
