@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 _OBSERVER_TIME = 0.01
 """Of the stop law's observer, s: measured velocities have noise."""
 
+_LAW_SHARE = 0.9
+"""Of the limits of torque rates that the stop law uses: gravity changes as well."""
+
 
 class Drive:
     """The law of the drives; arrays are of shape (n,), in the order of the joints.
@@ -61,8 +64,15 @@ class Drive:
         self._gravity: Gravity | None = gravity_beyond(model, gravity_included)
         self._not_reported = gravity_beyond(model, effort_included)
         self._added = gravity_beyond(known, False) or (lambda q: np.zeros_like(q))
-        self.stop = CoordinatedStop(model, limits, tau_max, dt, observer_time=_OBSERVER_TIME)
         self._tau_max, self._step = tau_max, rate_max * dt
+        self.stop = CoordinatedStop(
+            model,
+            limits,
+            tau_max,
+            dt,
+            observer_time=_OBSERVER_TIME,
+            torque_step=_LAW_SHARE * self._step,
+        )
         self.clipped = 0
         self.start(np.zeros(len(limits)), np.zeros(len(limits)), np.zeros(len(limits)))
 
@@ -87,9 +97,8 @@ class Drive:
             v: velocities, rad/s.
             applied: torques that the robot has as the last ones sent, N m.
         """
-        self.stop.start(q, v)
-        self._by_law = True
         self._sent = applied.copy()
+        self._start_law(q, v)
 
     def asked(self, q: Array, command: Array) -> Array:
         """Return the torque of the motors that a command asks for, N m."""
@@ -113,8 +122,7 @@ class Drive:
         """
         law = self.stop
         if not self._by_law and (command is None or held):
-            law.start(q, v)
-            self._by_law = True
+            self._start_law(q, v)
         if command is None:
             tau = law.torque(q, v)
         else:
@@ -130,3 +138,8 @@ class Drive:
         self.clipped += bool((sent != wanted).any())
         self._sent = np.where(np.isfinite(sent), sent, self._sent)
         return self._sent
+
+    def _start_law(self, q: Array, v: Array) -> None:
+        last = self._sent + self._added(q)
+        self.stop.start(q, v, np.clip(last, -self._tau_max, self._tau_max))
+        self._by_law = True

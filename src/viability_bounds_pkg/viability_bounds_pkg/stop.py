@@ -33,6 +33,8 @@ so that the torque goes on from that of the stop without a step, and ends at tha
 
 Motors whose torque follows with a first-order lag 1 / omega make (q + v / omega, v + a / omega) a
 double integrator that the torques asked for drive at once. All of the law is for that state then.
+
+Where torques may change by a limited amount in each step, this is another limit of the motors.
 """
 
 from __future__ import annotations
@@ -109,6 +111,8 @@ class CoordinatedStop:
         observer_time: time constant of the observer of disturbances, s; inf for none. It needs
             velocities whose noise is far below the acceleration limits times this time.
         motor_lag: time constants of the motors' torques, shape (n,), s; none where not given.
+        torque_step: by which torques may change from step to step, shape (n,), N m; any where not
+            given. `start` must be told the motors' torque then.
 
     Attributes:
         acceleration: chosen in the last step, rad/s^2.
@@ -129,6 +133,7 @@ class CoordinatedStop:
         *,
         observer_time: float = math.inf,
         motor_lag: ArrayLike | None = None,
+        torque_step: ArrayLike | None = None,
     ) -> None:
         names = list(model.names)[1:]
         if sorted(names) != sorted(limits.names) or model.nv != len(names):
@@ -150,6 +155,8 @@ class CoordinatedStop:
         self._share = 0.0 if math.isinf(observer_time) else -math.expm1(-dt / observer_time)
         self._scale = 0.5 * (limits.a_max - limits.a_min)
         self._lag = lag if lag.any() else None
+        given = np.full(len(names), np.inf) if torque_step is None else torque_step
+        self._step = joint_array("torque_step", given, limits.names)
         clear = np.minimum(HOLD_CLEARANCE, 0.5 * (limits.q_max - limits.q_min))
         self._lowest, self._highest = limits.q_min + clear, limits.q_max - clear
         self.start(np.zeros(len(names)), np.zeros(len(names)))
@@ -178,6 +185,8 @@ class CoordinatedStop:
         if self._share and motor_torque is not None and acceleration is not None:
             besides = self._inverse_dynamics(q, v, acceleration) - motor_torque
             self._disturbance = np.clip(besides, -self._tau_max, self._tau_max)
+        known = None if np.isinf(self._step).all() else motor_torque
+        self._last = known  # torques of the last step, where they matter
         self._M: Array | None = None
         self._resting = False  # the last step was one of a stop
         self._difference, self._share_left = np.zeros(n), 0.0
@@ -236,17 +245,27 @@ class CoordinatedStop:
         self._passed_for = self._passed_for + h if passed and command is not None else 0.0
         middle = q + 0.5 * h * v + 0.125 * h * h * a, v + 0.5 * h * a
         tau = self._inverse_dynamics(*middle, a) - self._disturbance
-        feasible = bool((np.abs(tau) <= self._tau_max).all())
+        low, high = self._torque_range()
+        feasible = bool(((tau >= low) & (tau <= high)).all())
         if self._share or not feasible:
             self._M = M = self._mass_matrix(middle[0])
             if not feasible:
-                nearest = self._nearest(tau, a, lower, upper, M)
-                tau = np.clip(tau + M @ (nearest - a), -self._tau_max, self._tau_max)
+                nearest = self._nearest(tau, a, lower, upper, M, (low, high))
+                tau = np.clip(tau + M @ (nearest - a), low, high)
                 middle = q + 0.5 * h * v + 0.125 * h * h * nearest, v + 0.5 * h * nearest
                 a = self._forward_dynamics(*middle, tau + self._disturbance)
         self.acceleration = a
         self._expected = lead + h * a
+        if self._last is not None:
+            self._last = tau
         return tau
+
+    def _torque_range(self) -> tuple[Array, Array]:
+        """Return the lowest and the highest torques that the motors can give in this step, N m."""
+        low, high = -self._tau_max, self._tau_max
+        if self._last is None:
+            return low, high
+        return np.maximum(low, self._last - self._step), np.minimum(high, self._last + self._step)
 
     def _gentle_return(
         self, q: Array, v: Array, lower: Array, upper: Array
@@ -325,12 +344,20 @@ class CoordinatedStop:
             settled, self._disturbance, np.clip(change, -self._tau_max, self._tau_max)
         )
 
-    def _nearest(self, tau: Array, a: Array, lower: Array, upper: Array, M: Array) -> Array:
+    def _nearest(
+        self,
+        tau: Array,
+        a: Array,
+        lower: Array,
+        upper: Array,
+        M: Array,
+        torques: tuple[Array, Array],
+    ) -> Array:
         """Return the accelerations nearest to `a` that the motors can give."""
         # More than the acceleration limits costs no other limit.
         lower = np.where(lower <= self._limits.a_min, -np.inf, lower)
         upper = np.where(upper >= self._limits.a_max, np.inf, upper)
-        return within_torque_limits(a, lower, upper, self._scale, M, tau, self._tau_max)
+        return within_torque_limits(a, lower, upper, self._scale, M, tau, *torques)
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         order = self._order
@@ -349,13 +376,20 @@ class CoordinatedStop:
 
 
 def within_torque_limits(
-    a: Array, lower: Array, upper: Array, scale: Array, M: Array, tau: Array, tau_max: Array
+    a: Array,
+    lower: Array,
+    upper: Array,
+    scale: Array,
+    M: Array,
+    tau: Array,
+    tau_min: Array,
+    tau_max: Array,
 ) -> Array:
     """Return the accelerations nearest to `a` whose torques are within the limits.
 
     A quadratic program, solved by DAQP [Arnstrom2022],
 
-        min  sum(x_i^2) + STIFFNESS sum(departure_i^2),   abs(tau + M S x) <= tau_max,
+        min  sum(x_i^2) + STIFFNESS sum(departure_i^2),   tau_min <= tau + M S x <= tau_max,
 
     with accelerations ``a + S x``, S the diagonal matrix of `scale`, and the departure of an
     acceleration from [lower, upper], in units of its scale. The torque limits are hard, the
@@ -368,7 +402,8 @@ def within_torque_limits(
         scale: unit of each acceleration, shape (n,), rad/s^2.
         M: mass matrix, shape (n, n), kg m^2.
         tau: torques for `a`, shape (n,), N m.
-        tau_max: torque limits, shape (n,), N m.
+        tau_min: least torques, shape (n,), N m.
+        tau_max: greatest torques, shape (n,), N m.
 
     Returns:
         Shape (n,), rad/s^2; `a` itself where DAQP finds nothing, as for numbers that are not
@@ -376,10 +411,10 @@ def within_torque_limits(
     """
     n = a.size
     one, none = np.eye(n), np.zeros((n, n))
-    rows = np.block([[one, -one], [M * (scale / tau_max[:, np.newaxis]), none]])
-    share = tau / tau_max
-    high = np.concatenate([(upper - a) / scale, 1.0 - share])
-    low = np.concatenate([(lower - a) / scale, -1.0 - share])
+    unit = 0.5 * (tau_max - tau_min)
+    rows = np.block([[one, -one], [M * (scale / unit[:, np.newaxis]), none]])
+    high = np.concatenate([(upper - a) / scale, (tau_max - tau) / unit])
+    low = np.concatenate([(lower - a) / scale, (tau_min - tau) / unit])
     x, _, flag, _ = daqp.solve(
         np.diag(np.repeat([1.0, STIFFNESS], n)),
         np.zeros(2 * n),

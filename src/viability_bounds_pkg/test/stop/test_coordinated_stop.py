@@ -219,11 +219,13 @@ def test_motors_that_are_too_weak_change_accelerations_by_the_least_amount(seed)
     a, scale, wide = rng.uniform(-1.0, 1.0, n), rng.uniform(1.0, 5.0, n), np.full(n, np.inf)
     tau = M @ a + rng.normal(size=n)
     tau_max = np.where(np.arange(n) < 2, 0.6 * np.abs(tau), 1.2 * np.abs(tau) + 0.5)
-    found = within_torque_limits(a, -wide, wide, scale, M, tau, tau_max)
+    found = within_torque_limits(a, -wide, wide, scale, M, tau, -tau_max, tau_max)
     change = np.linalg.inv(M * scale)
     best = lsq_linear(change, change @ tau, (-tau_max, tau_max), method="bvls").x
     np.testing.assert_allclose(tau + M @ (found - a), best, atol=1e-6)
-    enough = within_torque_limits(a, -wide, wide, scale, M, tau, 1.01 * np.abs(tau))
+    enough = within_torque_limits(
+        a, -wide, wide, scale, M, tau, -1.01 * np.abs(tau), 1.01 * np.abs(tau)
+    )
     np.testing.assert_array_equal(enough, a)
 
 
@@ -233,8 +235,8 @@ def test_a_joint_at_its_limit_is_helped_by_the_others():
     a, tau = np.array([-3.0, 0.0]), np.array([-3.0, -2.4])
     tau_max = np.array([2.0, 20.0])
     wide, edge = np.full(2, np.inf), np.array([-3.0, np.inf])
-    alone = within_torque_limits(a, -wide, wide, np.ones(2), M, tau, tau_max)
-    helped = within_torque_limits(a, -wide, edge, np.ones(2), M, tau, tau_max)
+    alone = within_torque_limits(a, -wide, wide, np.ones(2), M, tau, -tau_max, tau_max)
+    helped = within_torque_limits(a, -wide, edge, np.ones(2), M, tau, -tau_max, tau_max)
     assert alone[0] > -2.5
     assert helped[0] == pytest.approx(-3.0, abs=0.01)
     assert helped[1] > 1.0
