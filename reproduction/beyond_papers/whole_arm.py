@@ -196,7 +196,8 @@ def safe_set(axis: plt.Axes, elbow: float) -> None:
     loop = DirectLoop("baxter_left_arm")
     limits, n = loop.limits, len(loop.limits)
     braking = np.minimum(-limits.a_min, limits.a_max)
-    kept = PlanLimits(limits.q_min, limits.q_max, np.full(n, 1e-6), braking, loop.dt)
+    none = limits.velocity_offset, limits.deceleration_limit
+    kept = PlanLimits(limits.q_min, limits.q_max, np.full(n, 1e-6), braking, loop.dt, *none)
     tau_max = (1.0 - RESERVE) * loop.config.torque_max
     torques, times = PlanTorques(loop.model, kept, tau_max), np.geomspace(loop.dt, 1.5, 12)
     places = np.linspace(limits.q_min[SHOULDER], limits.q_max[SHOULDER], 161)

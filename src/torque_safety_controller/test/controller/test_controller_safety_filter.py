@@ -71,20 +71,23 @@ def test_a_load_is_known_to_the_plans_as_if_it_were_a_part_of_the_arm():
 # Motions
 
 
-def play(robot, seconds, goal=None, share=1.0, filtered=True):
+def play(robot, seconds, goal=None, share=1.0, filtered=True, curve=()):
     """Send an arm to a goal, or to and fro as hard as it can; then let it come to rest.
 
     With a share of its torque limits, and exact accelerations, each kept for a control period.
+    `curve` is `velocity_offset` and `deceleration_limit`.
 
     Returns:
         By how much positions and speeds passed their limits, and bounds were given up; where the
         arm is in the end; the outcomes of the filter.
     """
     arm, a_limits = load_arm(robot), acceleration_limits(robot)
-    joints = JointLimits(arm.model.names[1:], arm.q_min, arm.q_max, arm.v_max, *a_limits)
+    limits = arm.q_min, arm.q_max, arm.v_max, *a_limits, *curve
+    joints = JointLimits(arm.model.names[1:], *limits)
     margins = 0.05 * np.minimum(-a_limits.lower, a_limits.upper)
     solver = BoundsSolver(joints, 2.0 * arm.dt, margins, period=arm.dt)
-    keeper = make_filter(arm, a_limits, share)
+    speeds = {"velocity_offset": curve[0], "deceleration_limit": curve[1]} if curve else {}
+    keeper = make_filter(arm, a_limits, share, **speeds)
     controller = controllers.make(
         arm,
         *([keeper] if filtered else []),
@@ -105,7 +108,8 @@ def play(robot, seconds, goal=None, share=1.0, filtered=True):
         state = state.after(step.a, arm.dt)
         place = np.maximum(state.q - arm.q_max, arm.q_min - state.q).max()
         given_up = 0.0 if step.relaxation is None else step.relaxation.max()
-        now = [place, (np.abs(state.v) - arm.v_max).max(), given_up]
+        lowest, highest = joints.velocities(state.q)
+        now = [place, np.maximum(state.v - highest, lowest - state.v).max(), given_up]
         beyond = np.maximum(beyond, now)
     return beyond, state, keeper.outcomes
 
@@ -121,6 +125,15 @@ def test_no_limit_is_passed_and_in_the_end_the_arm_rests_where_it_can_be_held(ro
     assert outcomes["as wanted"] > 0.5 * outcomes.total()
     assert np.abs(v).max() < 0.05  # rad/s
     assert (np.abs(controllers.gravity(arm, q)) <= share * arm.tau_max).all()
+
+
+def test_speed_limits_that_depend_on_position_are_kept():
+    curve = np.full(7, 0.3), np.array([6.0, 2.5, 4.0, 4.0, 10.0, 6.0, 10.0])
+    beyond, (q, v), outcomes = play("panda", 2.0, share=0.6, curve=curve)
+    assert (beyond <= [1e-9, 1e-9, 1e-3]).all()
+    assert outcomes["outside"] == 0
+    assert outcomes["as wanted"] > 0.5 * outcomes.total()
+    assert np.abs(v).max() < 0.05  # rad/s
 
 
 def test_the_arm_stops_where_its_shoulder_can_still_hold_it_and_without_the_filter_it_falls():

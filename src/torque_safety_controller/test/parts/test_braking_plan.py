@@ -15,12 +15,15 @@ DT = 0.01
 N = 7
 LOW, HIGH = np.full(N, -1.0), np.full(N, 1.2)
 BRAKING = np.linspace(3.0, 15.0, N)
-LIMITS = PlanLimits(LOW, HIGH, np.full(N, 1e-3), BRAKING, DT)
+NONE = np.zeros(N), np.full(N, np.inf)
+LIMITS = PlanLimits(LOW, HIGH, np.full(N, 1e-3), BRAKING, DT, *NONE)
+CURVED = LIMITS._replace(velocity_offset=np.full(N, 0.3), deceleration_limit=0.8 * BRAKING)
 
 
-def sampled(q, v, periods):
+def sampled(q, v, periods, limits=LIMITS):
     """States of a plan at its samples, and by how far it passes limits."""
-    _, *states, beyond = sample(q, v, periods[np.newaxis], LOW, HIGH, LIMITS.tolerance, DT)
+    low, high, tolerance, _, *others = limits
+    _, *states, beyond = sample(q, v, periods[np.newaxis], low, high, tolerance, *others)
     return [each[0] for each in states], beyond[0]
 
 
@@ -60,6 +63,33 @@ def test_a_plan_ends_within_the_limits_and_its_rest_is_a_plan(seed):
             np.testing.assert_allclose(mine[0], other, atol=1e-8)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_plans_keep_speed_limits_that_depend_on_position(seed):
+    """Against the definition at many instants; one of an upper limit, and its mirror image."""
+    c, d = CURVED.velocity_offset, CURVED.deceleration_limit
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(0.2, 1.1, N)
+    v = rng.uniform(0.1, 1.0, N) * (np.sqrt(2.0 * d * (HIGH - q)) - c)
+
+    def too_near(periods):
+        """By how much less than the speed needs the distance to the limit is, at most."""
+        t = np.linspace(0.0, 1.0, 2000)[:, None] * periods * DT
+        speed = v * (1.0 - t / (periods * DT))
+        room = HIGH - (q + 0.5 * t * (v + speed))
+        return np.max((speed + c) ** 2 / (2.0 * d) - room - CURVED.tolerance, axis=0)
+
+    longest = braking_periods(q, v, np.array([9.0]), *CURVED)[0]
+    hardest = np.ceil(v / (BRAKING * DT))
+    assert (too_near(longest) <= 1e-9).all()
+    chosen = longest > hardest  # the others only just stop in time
+    assert chosen.any() and (too_near(longest + 1.0) > -CURVED.tolerance)[chosen].all()
+    for periods in (longest, longest + 1.0, 2.0 * longest):
+        expected = max(0.0, too_near(periods).max())
+        assert sampled(q, v, periods, CURVED)[1] == pytest.approx(expected, abs=1e-6)
+        mirrored = CURVED._replace(q_min=-HIGH, q_max=-LOW)
+        assert sampled(-q, -v, periods, mirrored)[1] == pytest.approx(expected, abs=1e-6)
+
+
 def passes(place, speed, A, limit):
     """Whether a joint passes an upper limit though it stops in whole periods with at most A."""
     needed = np.ceil(max(speed, 0.0) / (A * DT) - 1e-9)
@@ -71,8 +101,8 @@ def test_bounds_are_narrowed_to_the_last_acceleration_from_which_a_joint_can_sto
     """Against the definition: at each end, and just outside."""
     q, v = random_state(seed)
     free, far = np.full(N, np.inf), np.full(N, 1e4)
-    _, highest = narrow(q, v, -far, -free, free, LOW, HIGH, BRAKING, DT)
-    lowest, _ = narrow(q, v, far, -free, free, LOW, HIGH, BRAKING, DT)
+    _, highest = narrow(q, v, -far, -free, free, LOW, HIGH, BRAKING, DT, *NONE)
+    lowest, _ = narrow(q, v, far, -free, free, LOW, HIGH, BRAKING, DT, *NONE)
     for sign, ends, limit in ((1.0, highest, HIGH), (-1.0, -lowest, -LOW)):
         for j in range(N):
             for a, expected in ((ends[j], False), (ends[j] + 1e-3, True)):

@@ -161,6 +161,8 @@ def _safety_filter(config: ControllerConfiguration, model: pin.Model) -> SafetyF
         config.torque_max,
         config.dt,
         config.torque_reserve,
+        config.velocity_offset,
+        config.deceleration_limit,
     )
 
 

@@ -250,10 +250,23 @@ def _along_speed_limit(room: float, v: float, limit: np.record) -> float:
     it is the acceleration with which that falls at this speed.
     """
     c, d = limit.offset, 0.5 * limit.twice_braking
-    slack = max(2.0 * d * room - v * (v + 2.0 * c), 0.0) / v
-    a = 2.0 * d * v / (slack + 2.0 * (v + c) + sqrt(slack * (slack + 4.0 * c)))
+    a = curve_braking(room, v, c, d)
     # At the touch the speed is a c / (d - a).
     return -a if (v - a * limit.dt) * (d - a) <= a * c else inf
+
+
+@njit(cache=True, error_model="numpy")
+def curve_braking(room: float, v: float, c: float, d: float) -> float:
+    """Return the least constant deceleration that keeps v (v + 2 c) <= 2 d room, rad/s^2.
+
+    Args:
+        room: distance to the last place of rest, rad.
+        v: speed towards it, above 0, rad/s.
+        c: offset of the speed limit, above 0, rad/s.
+        d: its deceleration, rad/s^2.
+    """
+    slack = max(2.0 * d * room - v * (v + 2.0 * c), 0.0) / v
+    return 2.0 * d * v / (slack + 2.0 * (v + c) + sqrt(slack * (slack + 4.0 * c)))
 
 
 @njit(cache=True, error_model="numpy")

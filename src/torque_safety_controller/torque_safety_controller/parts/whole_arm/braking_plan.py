@@ -22,6 +22,8 @@ import pinocchio as pin
 from numba import njit
 from numpy.typing import NDArray
 
+from viability_bounds_pkg.bounds.kernel import curve_braking
+
 Array = NDArray[np.float64]
 
 UNIFORM = 20
@@ -51,6 +53,10 @@ class PlanLimits(NamedTuple):
     """Deceleration that plans prefer not to exceed, rad/s^2."""
     dt: float
     """Control period, s."""
+    velocity_offset: Array
+    """c of speed limits that depend on position, rad/s; 0 for none."""
+    deceleration_limit: Array
+    """d of them, rad/s^2."""
 
 
 @njit(cache=True)
@@ -63,11 +69,13 @@ def braking_periods(
     tolerance: Array,
     braking: Array,
     dt: float,
+    velocity_offset: Array,
+    deceleration_limit: Array,
 ) -> Array:
     """Return in how many periods each joint stands in the plans of given times.
 
     A joint takes longer where it would have to brake harder than `braking`, and less where it
-    would pass a position limit.
+    would pass a limit of position, or of speed at a position.
 
     Args:
         q: positions, shape (n,), rad.
@@ -78,6 +86,8 @@ def braking_periods(
         tolerance: as in `PlanLimits`, shape (n,), rad.
         braking: as in `PlanLimits`, shape (n,), rad/s^2.
         dt: control period, s.
+        velocity_offset: as in `PlanLimits`, shape (n,), rad/s.
+        deceleration_limit: as in `PlanLimits`, shape (n,), rad/s^2.
 
     Returns:
         Periods, at least 1, shape (plans, n).
@@ -87,16 +97,37 @@ def braking_periods(
         speed = abs(v[j])
         hardest = ceil(speed / (braking[j] * dt) - _ROUNDING)
         most = np.inf
-        way = 0.5 * dt * speed  # by which each period takes it further
-        if way > 0.0:
+        if 0.5 * dt * speed > 0.0:
             room = q_max[j] - q[j] if v[j] > 0.0 else q[j] - q_min[j]
-            inside = np.floor(room / way + _ROUNDING)
-            tolerated = np.floor((room + tolerance[j]) / way + _ROUNDING)
+            curve = velocity_offset[j], deceleration_limit[j]
+            inside = _periods_within(room, speed, dt, curve)
+            tolerated = _periods_within(room + tolerance[j], speed, dt, curve)
             most = max(inside, min(hardest, tolerated), 1.0)
         for i in range(times.size):
             wanted = ceil(times[i] / dt - _ROUNDING)
             periods[i, j] = min(max(wanted, hardest, 1.0), most)
     return periods
+
+
+@njit(cache=True)
+def _periods_within(room: float, speed: float, dt: float, curve: tuple[float, float]) -> float:
+    """Return the most periods in which a joint may stand; less than 1 where there are none."""
+    c, d = curve
+    if c == 0.0:
+        return float(np.floor(room / (0.5 * dt * speed) + _ROUNDING))
+    room -= 0.5 * c * c / d
+    if room <= 0.0:
+        return 0.0
+    return float(np.floor(speed / (dt * curve_braking(room, speed, c, d)) + _ROUNDING))
+
+
+@njit(cache=True)
+def _room_needed(speed: float, deceleration: float, c: float, d: float) -> float:
+    """Return the distance to the last place of rest that constant braking needs, c > 0, rad."""
+    touch = deceleration * c / (d - deceleration) if deceleration < d else np.inf
+    if touch < speed:
+        return 0.5 * speed * speed / deceleration + 0.5 * c * touch / d
+    return 0.5 * speed * (speed + 2.0 * c) / d
 
 
 @njit(cache=True)
@@ -110,6 +141,8 @@ def narrow(
     q_max: Array,
     braking: Array,
     dt: float,
+    velocity_offset: Array,
+    deceleration_limit: Array,
 ) -> tuple[Array, Array]:
     """Return acceleration bounds, narrowed to those after which each joint by itself can stop.
 
@@ -118,7 +151,8 @@ def narrow(
 
         s (1 + ceil(s)) <= c = (2 r - v dt) / (A dt^2),
 
-    so the largest s is ``min(h, c / (h + 1))``, h being the largest number with h^2 - 1 < c.
+    so the largest s is ``min(h, c / (h + 1))``, h being the largest number with h^2 - 1 < c. Where
+    its speed limit depends on position, it also ends the period below that.
 
     Args:
         q: positions, shape (n,), rad.
@@ -130,6 +164,8 @@ def narrow(
         q_max: highest, shape (n,), rad.
         braking: as in `PlanLimits`, shape (n,), rad/s^2.
         dt: control period, s.
+        velocity_offset: as in `PlanLimits`, shape (n,), rad/s.
+        deceleration_limit: as in `PlanLimits`, shape (n,), rad/s^2.
 
     Returns:
         Lower and upper bounds, shape (n,), rad/s^2; where nothing within those given is possible,
@@ -140,9 +176,15 @@ def narrow(
         A = braking[j]
         for sign in (-1.0, 1.0):
             room = q_max[j] - q[j] if sign > 0.0 else q[j] - q_min[j]
+            offset, d = velocity_offset[j], deceleration_limit[j]
+            room -= 0.5 * offset * offset / d
             c = min((2.0 * room - sign * v[j] * dt) / (A * dt * dt), _FAR)
             h = max(ceil(np.sqrt(max(1.0 + c, 0.0))) - 1.0, 0.0)
-            most = A * min(h, c / (h + 1.0)) - sign * v[j] / dt
+            speed = A * dt * min(h, c / (h + 1.0))
+            if offset > 0.0 and c > 0.0:
+                k, part = 0.5 * d * dt + offset, A * dt * dt * c * d
+                speed = min(speed, part / (k + np.sqrt(k * k + part)))
+            most = (speed - sign * v[j]) / dt
             if sign > 0.0:
                 high[j] = max(most, plan[j])
             else:
@@ -182,8 +224,12 @@ def sample(
     q_max: Array,
     tolerance: Array,
     dt: float,
+    velocity_offset: Array,
+    deceleration_limit: Array,
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the states of plans, as in `Samples`, and by how far they pass position limits.
+
+    A speed limit that depends on position is passed by the distance by which it is too near.
 
     Args:
         q: positions at the beginning, shape (n,), rad.
@@ -193,6 +239,8 @@ def sample(
         q_max: highest, shape (n,), rad.
         tolerance: as in `PlanLimits`, shape (n,), rad.
         dt: control period, s.
+        velocity_offset: as in `PlanLimits`, shape (n,), rad/s.
+        deceleration_limit: as in `PlanLimits`, shape (n,), rad/s^2.
 
     Returns:
         Samples; and the largest excess of a position beyond the tolerance, 0 for none, rad, shape
@@ -215,6 +263,11 @@ def sample(
             time = dt * periods[i, j]
             way = 0.5 * v[j] * time
             excess = max(max(q[j], q[j] + way) - q_max[j], q_min[j] - min(q[j], q[j] + way))
+            c, d = velocity_offset[j], deceleration_limit[j]
+            if c > 0.0 and v[j] != 0.0:
+                room = q_max[j] - q[j] if v[j] > 0.0 else q[j] - q_min[j]
+                needed = _room_needed(abs(v[j]), abs(v[j]) / time, c, d)
+                excess = max(excess, needed + 0.5 * c * c / d - room)
             beyond[i] = max(beyond[i], excess - tolerance[j])
             for k in range(clock.shape[1]):
                 left = max(1.0 - clock[i, k] / periods[i, j], 0.0)  # share of the time
@@ -269,8 +322,8 @@ class PlanTorques:
             periods: shape (plans, n).
             extra: torque that the motors give besides that of the model, shape (n,), N m.
         """
-        q_min, q_max, tolerance, _, dt = self._limits
-        *states, beyond = sample(q, v, periods, q_min, q_max, tolerance, dt)
+        q_min, q_max, tolerance, _, *others = self._limits
+        *states, beyond = sample(q, v, periods, q_min, q_max, tolerance, *others)
         samples = Samples(*states)
         n = q.size
         tau = np.empty_like(samples.q)

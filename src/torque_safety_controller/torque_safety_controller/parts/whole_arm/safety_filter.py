@@ -111,6 +111,9 @@ class SafetyFilter(Part):
         dt: control period, s.
         torque_reserve: torque that plans leave for what the model does not know, shape (n,), N m;
             less than what `RESERVE` leaves; None for none.
+        velocity_offset: of speed limits that depend on position, as `JointLimits` has them, shape
+            (n,), rad/s; None for none.
+        deceleration_limit: of the same, shape (n,), rad/s^2.
 
     Attributes:
         plan: acceleration with which the plan in hand goes on, shape (n,), rad/s^2.
@@ -135,8 +138,12 @@ class SafetyFilter(Part):
         tau_max: Array,
         dt: float,
         torque_reserve: Array | None = None,
+        velocity_offset: Array | None = None,
+        deceleration_limit: Array | None = None,
     ) -> None:
         n = model.nv
+        c = np.zeros(n) if velocity_offset is None else velocity_offset
+        d = np.full(n, np.inf) if deceleration_limit is None else deceleration_limit
         reserve = np.zeros(n) if torque_reserve is None else torque_reserve
         self._tau_max = tau_max
         self.usable: Array = (1.0 - RESERVE) * tau_max - reserve
@@ -144,7 +151,7 @@ class SafetyFilter(Part):
         braking = np.minimum(-acceleration_min, acceleration_max)
         clear = CLEARANCE * dt * dt * braking
         self._limits = PlanLimits(
-            position_min + clear, position_max - clear, TOLERANCE * clear, braking, dt
+            position_min + clear, position_max - clear, TOLERANCE * clear, braking, dt, c, d
         )
         self._plans = PlanTorques(model, self._limits, self.usable)
         self._model, self._data, self._dt = model, model.createData(), dt
@@ -243,8 +250,8 @@ class SafetyFilter(Part):
         self._most_beyond = float(plans.beyond[chosen])
         self.plan = plans.samples.a[chosen, FIRST]
         self.rest_torque = plans.tau[chosen, AT_REST]
-        q_min, q_max, _, braking, dt = self._limits
-        self.lower, self.upper = narrow(q, v, self.plan, lower, upper, q_min, q_max, braking, dt)
+        q_min, q_max, _, *others = self._limits
+        self.lower, self.upper = narrow(q, v, self.plan, lower, upper, q_min, q_max, *others)
         most = float((plans.peaks[chosen] * self._of_limit).max())
         self.lost = not most <= 1.0 + LOST
         return self._rows(plans, chosen) if most <= 1.0 else None
