@@ -16,6 +16,7 @@ import numpy as np
 from figure import table, write_part
 
 from viability_bounds_pkg import batch
+from viability_bounds_pkg.bounds.jerk import JerkBoundsSolver
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver, acceleration_bounds
 
@@ -60,12 +61,14 @@ def measure(name: str, case: Case, rng: np.random.Generator) -> None:
     # Small enough for (11) to hold, or not, as without.
     off = np.full(JOINTS, 1e-3)
     unsure = BoundsSolver(limits, dt, position_error=off, velocity_error=off)
+    limited = JerkBoundsSolver(limits, limits.a_max / (10.0 * dt), dt)
     calls = {
         "a call": solver.bounds,
         "as a function, which looks the solver up": partial(
             acceleration_bounds, limits=limits, dt=dt
         ),
         "for states with errors": unsure.bounds,
+        "with limited jerk": partial(limited.bounds, a=np.zeros(JOINTS)),
     }
     states = states_of(case, CALLS, rng)
     times = {

@@ -72,15 +72,18 @@ def compare(case, q, v, bounds=acceleration_bounds) -> Comparison:
     )
 
 
-def extreme_accelerations(case, q, v):
+def extreme_accelerations(case, q, v, last=0.0, change=np.inf):
     """Return the smallest and largest first acceleration of a state, and its margin.
+
+    Where `change` is finite, an acceleration differs from the one before by at most that much, the
+    first one from `last`, and the motion ends without acceleration.
 
     The margin is how much narrower, or if negative wider, limits the state could keep, in units
     of a dt^2 for positions and a dt for speeds, where a is the larger of the acceleration limits.
     It is 1 at most, and only a bound on itself where it is below zero. Accelerations are nan where
     the state is not viable; all is nan where the solver fails.
     """
-    motion = _Motion(case, q, v)
+    motion = _Motion(case, q, v, last, change)
     # The speed the state starts with is not the program's to choose.
     margin = min(motion.margin(), motion.v_max - abs(motion.v))
     if not margin >= -VIABLE:
@@ -97,14 +100,15 @@ class _Motion:
     Without that, the exchange would waste its rounds on corners that the motion need not touch.
     """
 
-    def __init__(self, case, q, v):
+    def __init__(self, case, q, v, last, change):
         q_min, q_max, v_max, a_min, a_max, dt = case
         self.unit = max(-a_min, a_max)
         scale = self.unit * dt**2
-        self.n = 8 + int(np.ceil(v_max / (min(-a_min, a_max) * dt)))
+        self.n = 8 + int(np.ceil(v_max / (min(-a_min, a_max) * dt) + 4.0 * self.unit / change))
         self.low, self.high, self.v_max = q_min / scale, q_max / scale, v_max * dt / scale
         self.a_range = a_min / self.unit, a_max / self.unit
         self.q, self.v = q / scale, v * dt / scale
+        self.last, self.change = last / self.unit, change / self.unit
         # Times at which the limits are kept: number of the step, and part of it.
         self.step, self.part = np.repeat(np.arange(self.n), 2), np.tile([0.5, 1.0], self.n)
 
@@ -142,6 +146,13 @@ class _Motion:
         at = np.concatenate([step, step, j, j])
         rows = np.vstack([way, -way, gain, -gain])
         rows = np.hstack([rows, np.ones((len(at), 1)), at[:, None] == j])
+        # What changes from step to step, from the last acceleration to none at the end.
+        change = np.eye(self.n + 1, self.n) - np.eye(self.n + 1, self.n, -1)
+        before = np.zeros(self.n + 1)
+        before[0] = self.last
+        for sign in (1.0, -1.0):
+            rows = np.vstack([rows, np.pad(sign * change, ((0, 0), (0, self.n + 1)))])
+            rhs = np.append(rhs, self.change + sign * before)
         exists = np.isfinite(rhs)
         tight = ("primal_feasibility_tolerance", "dual_feasibility_tolerance")
         for attempt in ({}, {"presolve": False}):  # at such tolerances it gives up now and then
