@@ -146,6 +146,9 @@ THUMB = (
     '<link name="thumb"/><joint name="thumb" type="prismatic"><parent link="upper"/>'
     f'<child link="thumb"/><axis xyz="0 1 0"/>{LIMIT}</joint>'
 )
+CURVED = (
+    f'{LIMIT}<position_based_velocity_limits deceleration_limit="6.0" velocity_offset="0.652"/>'
+)
 LOOP = '<joint name="rod" type="fixed"><parent link="base"/><child link="hand"/></joint>'
 
 
@@ -158,6 +161,19 @@ LOOP = '<joint name="rod" type="fixed"><parent link="base"/><child link="hand"/>
         (urdf(limit=LIMIT.replace('effort="30"', "")), "hand", "", ["wrist", "no effort limit"]),
         (urdf(limit=LIMIT.replace('"4"', '"0"')), "hand", "", ["wrist", "velocity", "data sheet"]),
         (urdf(limit=LIMIT.replace('"2"', '"-1"')), "hand", "", ["no room", "continuous"]),
+        (urdf(limit=CURVED.replace("6.0", "six")), "hand", "", ["wrist", "'six' for dece"]),
+        (
+            urdf(limit=CURVED.replace("velocity_o", "o")),
+            "hand",
+            "",
+            ["nothing", "at least 0"],
+        ),
+        (
+            urdf(limit=CURVED.replace("0.652", "5")),
+            "hand",
+            "",
+            ["no place to move", "4.17"],
+        ),
         (urdf(mass=0), "hand", "", ["'wrist' moves no inertia", "<inertial>"]),
         (urdf(more=LOOP), "hand", "", ["closed loop", "'wrist' and 'rod'"]),
         (urdf(more=FINGER.format("wrist")), "finger", "", ["mimics another", "tip hand"]),
@@ -316,6 +332,15 @@ def test_a_tool_is_a_mass_on_the_tip(tmp_path, capsys):
     with pytest.raises(SystemExit):
         run(tmp_path, urdf(), "hand", "--tool", "2")
     assert "--tool: must be KG,X,Y,Z, is '2'" in capsys.readouterr().err
+
+
+def test_speed_limits_that_depend_on_position_are_those_of_the_urdf(tmp_path, capsys):
+    assert run(tmp_path, urdf(limit=CURVED), "hand") == 0
+    files = [tmp_path / "an_arm.yaml", tmp_path / "imperfect" / "an_arm.yaml"]
+    for given in (files[:1], files):
+        limits = read_files(BoundsConfiguration, given, NODE).limits
+        assert limits.velocity_offset.tolist() == [0.0, 0.652]
+        assert limits.deceleration_limit.tolist() == [np.inf, 6.0]
 
 
 def test_an_imperfect_robot_declares_what_is_simulated(tmp_path, capsys):

@@ -18,10 +18,12 @@ from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
 from viability_bounds_pkg.robot.description import build_model, kinematic_order
 from viability_bounds_pkg.robot.mistakes import (
     MOVING,
+    SPEED_LIMITS,
     about,
     end_of,
     inertial_mistakes,
     inertial_oddities,
+    speed_limit,
     urdf_mistakes,
 )
 
@@ -49,6 +51,8 @@ class Chain:
         q_max: upper position limits, shape (n,), rad.
         v_max: speed limits, shape (n,), rad/s.
         tau_max: torque limits, shape (n,), N m.
+        velocity_offset: of speed limits that depend on position, shape (n,), rad/s; 0 for none.
+        deceleration_limit: of the same, shape (n,), rad/s^2; inf for none.
         continuous: whether a joint turns without end, shape (n,).
         slides: whether a joint is prismatic, shape (n,): its units are m, m/s and N.
         locked: the movable joints that are none of these.
@@ -65,6 +69,8 @@ class Chain:
     q_max: Array
     v_max: Array
     tau_max: Array
+    velocity_offset: Array
+    deceleration_limit: Array
     continuous: NDArray[np.bool_]
     slides: NDArray[np.bool_]
     locked: tuple[str, ...]
@@ -125,7 +131,7 @@ def find_chain(
     if wrong:
         raise NewRobotError("\n".join(wrong))
     order = kinematic_order(urdf, tuple(moving))
-    q_min, q_max, v_max, tau_max = np.array([limits[name] for name in order]).T
+    q_min, q_max, v_max, tau_max, c, d = np.array([limits[name] for name in order]).T
     model = build_model(urdf, order)
     _check_inertias(model)
     others = (each for each in root.findall("joint") if each.get("type") in MOVING)
@@ -138,6 +144,8 @@ def find_chain(
         q_max=q_max,
         v_max=v_max,
         tau_max=tau_max,
+        velocity_offset=c,
+        deceleration_limit=d,
         continuous=np.isinf(q_max),
         slides=np.array([moving[name].get("type") == "prismatic" for name in order]),
         locked=tuple(name for each in others if (name := each.get("name", "")) not in moving),
@@ -231,7 +239,10 @@ def _of_kinds(root: Element, way: Mapping[str, Element]) -> Iterator[tuple[str, 
 def _limits(
     moving: Mapping[str, Element], velocity_max: float
 ) -> tuple[dict[str, list[float]], list[str]]:
-    """Return position limits, speed and effort of joints by name, and what is wrong with them."""
+    """Return limits of joints by name, and what is wrong with them.
+
+    They are lower and upper position, speed, effort, velocity offset and deceleration limit.
+    """
     limits, wrong = {}, []
     lacking: dict[str, list[str]] = {}
     for name, joint in moving.items():
@@ -266,7 +277,17 @@ def _limits(
                 'write lower="..." and upper="..." into <limit>, or make it continuous'
             )
             lacking.setdefault(why, []).append(name)
-        limits[name] = [low, high, velocity, effort]
+        c, d = 0.0, math.inf
+        try:
+            c, d = speed_limit(joint)
+            if 0.0 < high - low <= c * c / d:
+                raise ValueError(
+                    f"<{SPEED_LIMITS}> leaves no place to move: velocity_offset^2 / "
+                    f"deceleration_limit is {c * c / d:.3g}, the range {high - low:.3g}"
+                )
+        except ValueError as error:
+            wrong.append(f"joint '{name}': {error}; correct it in the URDF, from the data sheet")
+        limits[name] = [low, high, velocity, effort, c, d]
     wrong += [f"{about('joint', each, 'has', 'have')} {why}" for why, each in lacking.items()]
     return limits, wrong
 

@@ -13,6 +13,7 @@ import yaml
 from torque_safety_controller.new_robot.chain import Chain
 from torque_safety_controller.new_robot.estimates import CAP, RESERVE, SHARE, Estimates
 from torque_safety_controller.new_robot.postures import Postures
+from viability_bounds_pkg.robot.mistakes import SPEED_LIMITS
 
 FILTER = f"""\
     # Limits are available in {SHARE:.0%} of states only; docs/theory/whole_arm.md.
@@ -107,6 +108,13 @@ def parameter_file(
     speeds += _comment(f"Speeds, {unit_of(chain, '/s')}: {e.why}")
     if e.speed_scale < 1.0 or chain.slowed:
         speeds.append(f"    velocity_max: {yaml_line(e.v_max)}")
+    if np.isfinite(chain.deceleration_limit).any():
+        speeds += _comment(
+            f"{unit_of(chain, '/s')} and {unit_of(chain, '/s^2')}: <{SPEED_LIMITS}> of the URDF, "
+            "with which the robot stops itself; docs/theory/bounds.md."
+        )
+        for name in ("velocity_offset", "deceleration_limit"):
+            speeds.append(f"    {name}: {yaml_line(getattr(chain, name))}")
     ends = ", ".join(
         f"{name} [{_found(low)}, {_found(high)}]"
         for name, low, high in zip(chain.joints, e.worst_min, e.worst_max, strict=True)

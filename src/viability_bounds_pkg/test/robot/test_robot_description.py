@@ -35,6 +35,18 @@ def test_a_joint_that_slides_needs_position_limits():
         check_with_urdf(config, urdf.format("prismatic"))
 
 
+def test_speed_limits_of_the_urdf_that_are_left_out_are_told():
+    values = {"robot_description": "topic", "joints": ["a"], "torque_max": [50.0]}
+    values |= {"position_min": [-1.0], "position_max": [1.0]}
+    urdf = """<robot name="x"><joint name="a" type="revolute"><position_based_velocity_limits
+        deceleration_limit="6.0" velocity_offset="0.652"/></joint></robot>"""
+    (line,) = check_with_urdf(read(RobotConfiguration, values), urdf)
+    assert "of a in the URDF is narrower" in line and "0.652 and 6" in line
+    values |= {"velocity_offset": [0.652], "deceleration_limit": [6.0]}
+    assert not check_with_urdf(read(RobotConfiguration, values), urdf)
+    assert not check_with_urdf(read(RobotConfiguration, values), urdf.replace("6.0", "six"))
+
+
 def test_a_joint_that_is_locked_outside_its_limits_is_told():
     values = {"robot_description": "topic", "joints": ["a"], "torque_max": [50.0]}
     values |= {"position_min": [-1.0], "position_max": [1.0], "locked_joints": ["waist"]}

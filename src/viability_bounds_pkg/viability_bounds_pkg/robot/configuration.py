@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import ClassVar
@@ -29,7 +30,12 @@ from viability_bounds_pkg.parameter import (
 )
 from viability_bounds_pkg.robot.description import build_model
 from viability_bounds_pkg.robot.files import RobotDescriptionError, read_urdf
-from viability_bounds_pkg.robot.mistakes import inertial_mistakes, inertial_oddities
+from viability_bounds_pkg.robot.mistakes import (
+    SPEED_LIMITS,
+    inertial_mistakes,
+    inertial_oddities,
+    speed_limit,
+)
 
 Array = NDArray[np.float64]
 
@@ -327,6 +333,13 @@ def _unusual(config: RobotConfiguration, j: int, joint: ElementTree.Element) -> 
             yield (
                 f"parameter '{parameter}' is {values[j]:g} for {name}, beyond the {of_urdf:g} "
                 "of the URDF"
+            )
+    with suppress(ValueError):
+        c, d = speed_limit(joint)
+        if config.velocity_offset[j] < c or config.deceleration_limit[j] > d:
+            yield (
+                f"<{SPEED_LIMITS}> of {name} in the URDF is narrower than 'velocity_offset' and "
+                f"'deceleration_limit', {c:g} and {d:g}"
             )
     start = getattr(config, "start_positions", None)
     low, high = config.position_min[j], config.position_max[j]

@@ -28,6 +28,36 @@ _SMALLEST = 1e-12
 """Moment of inertia that is rounding, kg m^2."""
 
 
+SPEED_LIMITS = "position_based_velocity_limits"
+"""Element of a joint, as in Franka's URDF: its speed limit depends on position."""
+
+
+def speed_limit(joint: Element) -> tuple[float, float]:
+    """Return velocity offset, rad/s, and deceleration limit, rad/s^2, of a joint's speed limit.
+
+    Without the element `SPEED_LIMITS` they are 0 and inf: it does not depend on position.
+
+    Raises:
+        ValueError: what is wrong with the element.
+    """
+    element = joint.find(SPEED_LIMITS)
+    if element is None:
+        return 0.0, math.inf
+    needs = (("velocity_offset", 0.0), ("deceleration_limit", 1e-9))
+    values = []
+    for key, least in needs:
+        text = element.get(key, "nothing")
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value < math.inf:
+            allowed = "a number, at least 0" if least == 0.0 else "a number above 0"
+            raise ValueError(f"<{SPEED_LIMITS}> has {text!r} for {key}; allowed: {allowed}")
+        values.append(value)
+    return values[0], values[1]
+
+
 def urdf_mistakes(root: Element) -> list[str]:
     """Return what is wrong with a URDF whatever it is used for, a line each.
 
