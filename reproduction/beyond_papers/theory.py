@@ -15,6 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from chain import ROOT, load_node_values
 from figure import Figure, reproduce
+from speed_limits import speed_limits
 
 from viability_bounds_pkg import viability
 from viability_bounds_pkg.baselines import naive_bounds
@@ -219,6 +220,7 @@ def estimator() -> Figure:
 
 PARTS: dict[str, Callable[[], Figure]] = {
     "bounds": bounds,
+    "speed_limits": speed_limits,
     "stopping": stopping,
     "estimator": estimator,
 }
