@@ -31,7 +31,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from torque_safety_controller.node import goals
+from torque_safety_controller.node import waiting_goals
 from torque_safety_controller.node.goal_messages import pose_from_message
 from torque_safety_controller.node.periodic import StateStream
 from torque_safety_controller.qp import AccelerationRange
@@ -261,7 +261,7 @@ def test_jogs_that_waited_for_the_robot_are_dropped(ros, capfd):
 
 
 def test_a_goal_that_waits_is_told_and_one_of_another_clock_is_refused(ros, monkeypatch, capfd):
-    monkeypatch.setattr(goals, "WAITING_MAX", 2)
+    monkeypatch.setattr(waiting_goals, "WAITING_MAX", 2)
     monkeypatch.setattr(refusals, "SAME_PERIOD", math.inf)
     chain = NodeChain(ros, goal_ahead_max=2.0)
 

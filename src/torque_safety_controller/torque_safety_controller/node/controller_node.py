@@ -91,7 +91,7 @@ class ControllerNode(ArmNode):
         self._limits = LimitsReader(config.joints, self._warn)
         self._goals = GoalSubscriber(self, self._controller, config, base, self._states)
         self._wrenches = WrenchSubscriber(
-            self, self._controller.find(Interaction), self._goals, config, base
+            self, self._controller.find(Interaction), self._goals.waiting, config, base
         )
         self._payload = PayloadSubscriber(self, self._controller.robot.payload, self._on_payload)
         self._supervisor = Supervisor(
@@ -113,7 +113,7 @@ class ControllerNode(ArmNode):
             self._supervisor,
             self._states,
             {
-                "goals_refused": self._goals.refused,
+                "goals_refused": self._goals.waiting.refused,
                 "states_refused": self._states.refused,
                 "limits_refused": self._limits.refused,
                 "wrenches_refused": self._wrenches.refused,

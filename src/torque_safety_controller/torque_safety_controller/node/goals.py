@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Goals from topics: kept until the time of their stamps, and given to the controller then."""
+"""Goals from topics, given to the controller when they are due."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
-from functools import partial
-from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -21,7 +18,6 @@ from torque_safety_controller.driving.trajectory import (
     JointMotion,
     Motion,
     TrajectoryMotion,
-    TrajectoryPassed,
 )
 from torque_safety_controller.node.goal_messages import (
     GoalRefused,
@@ -44,17 +40,14 @@ from torque_safety_controller.node.topics import (
     TARGET_POSTURE,
     TARGET_TRAJECTORY,
 )
+from torque_safety_controller.node.waiting_goals import WaitingGoals
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.refusals import RefusalLog
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import Topic
 from viability_bounds_pkg.state import State, whole_turns
 
 Array = NDArray[np.float64]
-
-WAITING_MAX = 1000
-"""So many goals may wait for their time."""
 
 _ROUNDING = 1e-9
 
@@ -68,36 +61,22 @@ NEEDED = {
 """Gains that are not to be 0 where goals of a topic are to be reached."""
 
 
-class _Waiting(NamedTuple):
-    """A goal that waits for its time."""
-
-    stamp: int
-    """ns."""
-    topic: Topic
-    apply: Callable[[], None]
-    """May raise `GoalRefused` or `TrajectoryPassed`."""
-
-
 class GoalSubscriber:
     """Subscribes to the topics of goals, ``target_*`` and ``jog_*``; what came last counts.
 
-    Goals wait until they are due: a stamp of zero, or one that has passed, takes effect with the
-    next control step; one ahead takes effect with the first state at or after it, which makes a
-    plan of goals repeatable. One that is further ahead than `goal_ahead_max` is refused: it is of
-    another clock. So are jogs with a stamp that differs from that of the newest joint state by
-    more than `TIMEOUT`, then or when they are due, and trajectories that have passed. Where
-    several nodes publish one of these topics, what comes on it is refused, and the arm is to hold
-    until there is one.
+    Jogs with a stamp that differs from that of the newest joint state by more than `TIMEOUT`, then
+    or when they are due, are refused, and trajectories that have passed. Where several nodes
+    publish one of these topics, the arm is to hold until there is one.
 
     Args:
-        node: listens and logs what is refused.
+        node: listens, and logs.
         controller: is given the goals when they are due.
         config: has the names and limits that they are checked by.
         base: placement of the base frame in the URDF's root frame.
         states: tell the robot's time.
 
     Attributes:
-        refused: how many goals, and publishers of goals, were refused, by topic.
+        waiting: goals that are not due yet.
     """
 
     def __init__(
@@ -108,27 +87,21 @@ class GoalSubscriber:
         base: pin.SE3,
         states: StateStream,
     ) -> None:
-        self._node, self._watch = node, node.publisher_watch
+        self._node, self.waiting = node, WaitingGoals(node, states, config.goal_ahead_max)
         self._controller, self._config, self._base = controller, config, base
         self._states, self._held = states, controller.goals.held
-        self.refused: Counter[str] = Counter()
         self._motion: Motion | None = None
-        self._waiting: list[_Waiting] = []
-        self._contested: set[str] = set()
         self._unserved: set[str] = set()
-        self._refusals = RefusalLog(node.get_logger().warning)
         self._held_up: Motion | None = None
-        self.listen(TARGET_POSE, self._on_pose)
+        listen = self.waiting.listen
+        listen(TARGET_POSE, self._on_pose)
         if len(config.end_effectors) > 1:
-            self.listen(TARGET_POSE_SECOND, self._on_second_pose)
-        self.listen(TARGET_POSTURE, self._on_posture)
-        self.listen(TARGET_TRAJECTORY, self._on_trajectory)
-        self.listen(TARGET_JOINT_TRAJECTORY, self._on_joint_trajectory)
-        self.listen(JOG_HAND, self._on_hand_jog)
-        self.listen(JOG_JOINTS, self._on_joint_jog)
-
-    def __len__(self) -> int:
-        return len(self._waiting)
+            listen(TARGET_POSE_SECOND, self._on_second_pose)
+        listen(TARGET_POSTURE, self._on_posture)
+        listen(TARGET_TRAJECTORY, self._on_trajectory)
+        listen(TARGET_JOINT_TRAJECTORY, self._on_joint_trajectory)
+        listen(JOG_HAND, self._on_hand_jog)
+        listen(JOG_JOINTS, self._on_joint_jog)
 
     @property
     def motion(self) -> Motion | None:
@@ -146,54 +119,14 @@ class GoalSubscriber:
         motion = self.motion
         if isinstance(motion, (JointMotion, TrajectoryMotion)) and motion.pace.waits:
             return f"{_topic_of(motion)} waits for the arm"
-        if not self._waiting or (left := self._waiting[0].stamp - self._states.stamp) <= 0:
-            return ""
-        return f"{self._waiting[0].topic.name} due in {1e-9 * left:.1f} s"
+        return self.waiting.due
 
     @property
     def trouble(self) -> str:
         """Cause not to serve goals, a key of `modes.CAUSES`; empty for none."""
-        if self._contested:
-            self._contested = {name for name in self._contested if not self._watch.admits(name)}
-            if self._contested:
-                return "rival"
+        if self.waiting.contested:
+            return "rival"
         return "" if self._controller.goals.any else "no goal"
-
-    def listen(self, topic: Topic, callback: Callable[[Any], None]) -> None:
-        """Subscribe to a topic of goals; `callback` gets those of a node that is alone with it.
-
-        It may raise `GoalRefused`.
-        """
-        name = self._node.resolve_topic_name(topic.name)
-        self._watch.add(name)
-
-        def receive(message: Any) -> None:
-            if self._watch.admits(name):
-                try:
-                    callback(message)
-                except GoalRefused as error:
-                    self.refuse(topic, error)
-            elif name in self._contested:  # told already; more may come at any rate
-                self.refused[topic.name] += 1
-            else:
-                self._contested.add(name)
-                self.refuse(topic, f"several nodes publish '{name}'")
-
-        topic.subscription(self._node, receive, partial(self.refuse, topic))
-
-    def refuse(self, topic: Topic, reason: Exception | str) -> None:
-        """Count and log a goal that cannot be followed, or a publisher that cannot be heard."""
-        self.refused[topic.name] += 1
-        self._refusals.tell(f"{topic.name} refused: {reason}")
-
-    def add(self, topic: Topic, message: Any, apply: Callable[[], None]) -> None:
-        """Call `apply` when the time in the header of `message` has come; see `_Waiting`."""
-        stamp = stamp_to_ns(message.header.stamp)
-        check_stamp(stamp, self._states.stamp, self._config.goal_ahead_max)
-        if len(self._waiting) >= WAITING_MAX:
-            raise GoalRefused(f"{WAITING_MAX} goals wait for their time already")
-        self._waiting.append(_Waiting(stamp, topic, apply))
-        self._waiting.sort(key=lambda goal: goal.stamp)
 
     def apply_due(self, stamp: int, state: State) -> bool:
         """Apply the goals that are due at `stamp`, ns, and advance a motion.
@@ -209,18 +142,11 @@ class GoalSubscriber:
         """
         if self._held != self._controller.goals.held:
             self._held, self.motion = self._controller.goals.held, None
-        due, waiting, ahead = False, self._waiting, self._config.goal_ahead_max
-        # It came before the first state, or the robot's time has begun anew.
-        while waiting and 1e-9 * (waiting[-1].stamp - stamp) > ahead:
-            goal = waiting.pop()
-            self._try(goal.topic, partial(check_stamp, goal.stamp, stamp, ahead))
-        while waiting and waiting[0].stamp <= stamp:
-            goal = waiting.pop(0)
-            self._try(goal.topic, goal.apply)
-            self._warn_unserved(goal.topic.name)
-            due = True
+        due = self.waiting.apply_due(stamp)
+        for topic in due:
+            self._warn_unserved(topic)
         if self.motion is None:
-            return due
+            return bool(due)
         if not self.motion.advance(self._controller, state, stamp):
             self.motion = None
         elif isinstance(self.motion, (JointMotion, TrajectoryMotion)):
@@ -232,19 +158,13 @@ class GoalSubscriber:
         if motion.pace.lost:
             what = "given up"
             self._jog_joints(np.zeros(len(self._config.joints)))  # to rest
-            self.refused[_topic_of(motion)] += 1
+            self.waiting.refused[_topic_of(motion)] += 1
         elif motion.pace.waits and self._held_up is not motion:
             self._held_up, what = motion, "waits for the arm"
         else:
             return
         where = motion.where(self._config.joints)
         self._node.get_logger().warning(f"{_topic_of(motion)} {what}: {where}")
-
-    def _try(self, topic: Topic, act: Callable[[], None]) -> None:
-        try:
-            act()
-        except (GoalRefused, TrajectoryPassed) as error:
-            self.refuse(topic, error)
 
     def _warn_unserved(self, topic: str) -> None:
         """Warn of the first of the goals that no task brings the arm to."""
@@ -266,7 +186,7 @@ class GoalSubscriber:
         if not motion.isIdentity(_ROUNDING):
             if isinstance(self.motion, TrajectoryMotion):
                 self.motion = None
-                self.refuse(TARGET_TRAJECTORY, "base_frame has moved")
+                self.waiting.refuse(TARGET_TRAJECTORY, "base_frame has moved")
             self._controller.goals.move_poses(motion)
 
     # Goals at rest
@@ -278,7 +198,7 @@ class GoalSubscriber:
             self.motion = None
             self._controller.goals.set_pose(pose)
 
-        self.add(TARGET_POSE, message, apply)
+        self.waiting.add(TARGET_POSE, message, apply)
 
     def _on_second_pose(self, message: PoseStamped) -> None:
         pose = self._base * pose_from_message(message, self._config.base_frame)
@@ -288,7 +208,7 @@ class GoalSubscriber:
                 self.motion = None
             self._controller.goals.set_other_pose(0, pose)
 
-        self.add(TARGET_POSE_SECOND, message, apply)
+        self.waiting.add(TARGET_POSE_SECOND, message, apply)
 
     def _on_posture(self, message: JointState) -> None:
         q_des = posture_from_message(message, self._config)
@@ -299,7 +219,7 @@ class GoalSubscriber:
             turns = whole_turns(q_des, self._states.q, self._config.continuous)
             self._controller.goals.set_posture(q_des + turns)
 
-        self.add(TARGET_POSTURE, message, apply)
+        self.waiting.add(TARGET_POSTURE, message, apply)
 
     # Goals that move
 
@@ -308,12 +228,14 @@ class GoalSubscriber:
         trajectory = trajectory_from_message(message, *frames, self._base)
         begin = stamp_to_ns(message.header.stamp)
         motion = TrajectoryMotion(trajectory, begin, self._config.dt)
-        self.add(TARGET_TRAJECTORY, message, lambda: self._move(motion))
+        self.waiting.add(TARGET_TRAJECTORY, message, lambda: self._move(motion))
 
     def _on_joint_trajectory(self, message: JointTrajectory) -> None:
         config, topic = self._config, TARGET_JOINT_TRAJECTORY
         if not message.points:  # as controllers of trajectories take it: stop
-            self.add(topic, message, lambda: self._jog_joints(np.zeros(len(config.joints))))
+            self.waiting.add(
+                topic, message, lambda: self._jog_joints(np.zeros(len(config.joints)))
+            )
             return
         trajectory = joint_trajectory_from_message(message, config)
         excess = trajectory.fastest() / config.velocity_max
@@ -325,7 +247,7 @@ class GoalSubscriber:
         limits = config.position_min, config.position_max, config.velocity_max
         begin = stamp_to_ns(message.header.stamp)
         motion = JointMotion(trajectory, begin, config.dt, *limits, config.continuous)
-        self.add(topic, message, lambda: self._move(motion))
+        self.waiting.add(topic, message, lambda: self._move(motion))
 
     def _on_hand_jog(self, message: TwistStamped) -> None:
         hand, frame = self._config.end_effectors[0], message.header.frame_id
@@ -371,7 +293,7 @@ class GoalSubscriber:
                 raise GoalRefused(f"no joint state has come within {TIMEOUT:g} s of it")
             jog()
 
-        self.add(topic, message, apply)
+        self.waiting.add(topic, message, apply)
 
 
 def _topic_of(motion: JointMotion | TrajectoryMotion) -> str:

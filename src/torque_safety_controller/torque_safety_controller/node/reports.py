@@ -132,7 +132,7 @@ class ControllerReport:
             "bounds_last_relaxation_rad_s2": self._last_relaxation,
             "latency_p50_us": 1e6 * self._latencies.percentile(50),
             "latency_p99_us": 1e6 * self._latencies.percentile(99),
-            "goals_pending": len(self._goals),
+            "goals_pending": len(self._goals.waiting),
             "payload": str(self._controller.robot.payload),
         }
         for more in (self._fixed, self._refused, self._supervisor.values()):

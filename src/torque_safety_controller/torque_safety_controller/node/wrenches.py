@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from std_srvs.srv import Trigger
 
 from torque_safety_controller.node.goal_messages import GoalRefused, check_frame, numbers_of
-from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.topics import TARE_FT_SENSOR, TARGET_WRENCH
+from torque_safety_controller.node.waiting_goals import WaitingGoals
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.contact.interaction import Compliance, Interaction
 from torque_safety_controller.parts.contact.wrench_sensor import (
@@ -53,7 +53,7 @@ class WrenchSubscriber:
         self,
         node: ArmNode,
         interaction: Interaction | None,
-        goals: GoalSubscriber,
+        goals: WaitingGoals,
         config: ControllerConfiguration,
         base: pin.SE3,
     ) -> None:
