@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from task_arm import TaskArm
 
-from torque_safety_controller.integral_feedback.nullspace_step import (
+from torque_safety_controller.integral_feedback.task_inverse import (
     dynamically_consistent_inverse,
 )
 

@@ -20,7 +20,7 @@ from torque_safety_controller.integral_feedback.nullspace import (
     NullspaceCompliance,
     TaskShapeError,
 )
-from torque_safety_controller.integral_feedback.nullspace_step import THRESHOLD
+from torque_safety_controller.integral_feedback.task_inverse import THRESHOLD
 
 DT = 2e-3
 

@@ -8,7 +8,7 @@ from task_arm import TaskArm, arm_terms
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 from torque_safety_controller.integral_feedback.nullspace import NullspaceCompliance
-from torque_safety_controller.integral_feedback.nullspace_step import (
+from torque_safety_controller.integral_feedback.task_inverse import (
     THRESHOLD,
     dynamically_consistent_inverse,
 )

@@ -23,15 +23,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
+from torque_safety_controller.anti_windup import clip, scale_factor
 from torque_safety_controller.integral_feedback.law import ArmTerms, IntegralLaw
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
-from torque_safety_controller.integral_feedback.nullspace_step import (
-    THRESHOLD,
-    advance,
-    dynamically_consistent_inverse,
-)
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.integral_feedback.task_inverse import TaskInverse, task_inverse
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
@@ -115,7 +113,8 @@ class TaskLaw(IntegralLaw):
         """
         self.check(arm, torque)
         M, C, J, J_dot, _ = arm
-        J_plus, _ = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
+        X, Y_inv, _ = task_inverse(J, J_dot, M, C + C.T)
+        J_plus = X @ Y_inv
         K = self.settings.gain * np.diagonal(M)
         B = (1.0 - self.settings.mu) * (J_plus.T * K) @ J_plus
         return J_plus @ (np.linalg.pinv(B, _SINGULAR) @ (J_plus.T @ torque)), J_plus
@@ -145,18 +144,33 @@ class NullspaceCompliance(TaskLaw):
 
     def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
         """See `IntegralLaw`."""
-        settings = self.settings
-        slow, fast = settings.slow_leak_rate, settings.fast_leak_rate
-        factors = (*leak_factors(slow, dt, False), *leak_factors(fast, dt, False))
-        numbers = (settings.gain, settings.mu, fast_weight(settings))
-        a, s, integral, root, torque, limited, usable = advance(
-            tuple(self.memory), tuple(arm), a_last, dt, settings.budget, numbers, factors
-        )
-        if not usable:
-            raise ValueError("M must be positive definite, and all numbers finite")
-        self.memory = Memory(a, s, integral, root, arm.v.copy(), arm.J.copy())
-        at_limit = np.abs(torque) >= _AT_LIMIT * settings.budget if limited else self._none
-        self.saturated = at_limit
+        settings, memory = self.settings, self.memory
+        M, C, J, J_dot, v = arm
+        slow, slow_gain = leak_factors(settings.slow_leak_rate, dt, False)
+        fast, fast_gain = leak_factors(settings.fast_leak_rate, dt, False)
+        inverse, weights = task_inverse(J, J_dot, M, C + C.T), M.diagonal()
+        J_plus = inverse.X.dot(inverse.Y_inv)
+        left = slow * memory.s
+        s = left + slow_gain * (a_last * dt - (v - memory.v))
+        # With the middle of s the product rule is exact: J a grows by the middle of J times the
+        # increment of s.
+        a = s - J_plus.dot(slow * memory.integral + (J - memory.J).dot(0.5 * (left + s)))
+        # The fast memory takes fast_gain of what a gained, of which slow_gain is seen.
+        ratio, root = fast_gain / slow_gain, np.sqrt(weights)
+        x = (1.0 - ratio) * a + (ratio * slow - fast) * memory.a + fast * memory.root / root
+        if slow > 0.0:
+            a = a - (1.0 - fast / slow) * (a - J_plus.dot(J.dot(a)))
+        H = _torque_matrix(arm, inverse, settings)
+        torque = H.dot(a) - settings.mu * settings.gain * weights * x
+        limited = not (np.abs(torque) <= settings.budget).all()
+        if limited:
+            a, x, torque = _limited(M, H, settings.budget, a, x, torque, fast_weight(settings))
+        integral = -J.dot(a)
+        s, root = a + J_plus.dot(integral), root * x
+        if not math.isfinite(sum(torque.tolist()) + sum(s.tolist()) + sum(root.tolist())):
+            raise ValueError("all numbers must be finite")
+        self.memory = Memory(a, s, integral, root, v.copy(), J.copy())
+        self.saturated = np.abs(torque) >= _AT_LIMIT * settings.budget if limited else self._none
         return torque
 
     def initialise(self, torque: Array, arm: ArmTerms) -> Array:
@@ -175,3 +189,70 @@ def fast_weight(settings: IntegralSettings) -> float:
     if settings.fast_leak_rate > settings.slow_leak_rate:
         return settings.mu * settings.gain / (settings.fast_leak_rate - settings.slow_leak_rate)
     return 0.0
+
+
+def _torque_matrix(arm: ArmTerms, inverse: TaskInverse, settings: IntegralSettings) -> Array:
+    """Return H of the torque H a - mu K x of eq. (21) with (26), shape (n, n).
+
+    With J^+ J' s + (J^+)' integral, where s = (1 - P) a and integral = - J a, and with W = Y^-1 J
+    and B = M X' W = J'^T W - M' P, all of (21) and (26) but the fast memory is
+
+        H = C + B - W^T (J' + X^T (B - (1 - mu) K P) + (c D)' W) + mu K.
+    """
+    _, C, J, J_dot, _ = arm
+    X, Y_inv, damping_rate = inverse
+    K, mu = settings.gain * arm.M.diagonal(), settings.mu
+    # dot takes half as long as @ for matrices of this size.
+    W = Y_inv.dot(J)
+    P = X.dot(W)
+    B = J_dot.T.dot(W) - (C + C.T).dot(P)
+    inner = J_dot + X.T.dot(B - ((1.0 - mu) * K)[:, None] * P) + damping_rate.dot(W)
+    H: Array = C + B - W.T.dot(inner)
+    H.ravel("K")[:: len(H) + 1] += mu * K
+    return H
+
+
+def _limited(
+    M: Array, H: Array, limit: Array, a: Array, x: Array, torque: Array, weight: float
+) -> tuple[Array, Array, Array]:
+    """Return a memory and its torque with |torque| <= limit that stores no more energy.
+
+    Scaling all of the memory by (10) does both, but weakens every joint for the sake of one.
+    So a is changed such that only the torques beyond their limits change, to the limits. If
+    that stores more energy than before, it is done in part: the memory is the furthest point
+    on the way from the scaled one that does not. Both ends are within the limits, and with
+    them the way.
+
+    Args:
+        M: mass matrix, shape (n, n).
+        H: of `_torque_matrix`.
+        limit: shape (n,), >= 0, may be infinite.
+        a: shape (n,).
+        x: shape (n,).
+        torque: that they give, shape (n,).
+        weight: of the fast memory in the energy, see `fast_weight`.
+
+    Returns:
+        a, x and their torque, shape (n,) each.
+    """
+    scale, cut = scale_factor(torque, limit), clip(torque, limit) - torque
+    regular = H.copy()
+    regular.ravel()[:: len(H) + 1] += _SINGULAR * (np.abs(H).max() + 1e-300)
+    shift, way = lapack.dgesv(regular, cut)[2], 0.0
+    if np.abs(H.dot(shift) - cut).max() <= 1e-6 * np.abs(cut).max():
+        # How far from (scale a, scale x) to (a + shift, x) the energy is that of (a, x).
+        da, dx = (1.0 - scale) * a + shift, (1.0 - scale) * x
+        Ma, wx = M.dot(a), weight * M.diagonal() * x
+        energy = a.dot(Ma) + x.dot(wx)  # twice, as the next two
+        spare = (1.0 - scale * scale) * energy
+        linear = scale * (da.dot(Ma) + dx.dot(wx))
+        square = da.dot(M.dot(da)) + (1.0 - scale) * dx.dot(wx)
+        if square + 2.0 * linear <= spare:
+            way = 1.0
+        else:
+            root = math.sqrt(linear * linear + square * spare)
+            way = spare / (linear + root) if linear > 0.0 else (root - linear) / square
+    else:
+        shift = np.zeros_like(a)
+    keep = scale + way * (1.0 - scale)
+    return keep * a + way * shift, keep * x, clip(keep * torque + way * cut, limit)

@@ -22,11 +22,8 @@ from numpy.typing import NDArray
 from torque_safety_controller.anti_windup import project_to_limits, scale_to_limits
 from torque_safety_controller.integral_feedback.law import ArmTerms
 from torque_safety_controller.integral_feedback.nullspace import TaskLaw
-from torque_safety_controller.integral_feedback.nullspace_step import (
-    THRESHOLD,
-    dynamically_consistent_inverse,
-)
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.integral_feedback.task_inverse import dynamically_consistent_inverse
 
 Array = NDArray[np.float64]
 
@@ -78,7 +75,7 @@ class PrintedCompliance(TaskLaw):
         self.check(arm, a_last)
         memory, settings, mu = self.memory, self.settings, self.settings.mu
         M, C, J, J_dot, v = arm
-        J_plus, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
+        J_plus, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, C + C.T)
         s = memory.s + a_last * dt - (v - memory.v)
         integral = memory.integral + (J - memory.J) @ (0.5 * (memory.s + s))
         a = s - J_plus @ integral
