@@ -15,6 +15,7 @@ from pylibfranka import (
     FrankaException,
     NetworkException,
     RealtimeConfig,
+    RealtimeException,
     Robot,
     RobotMode,
     RobotState,
@@ -36,6 +37,10 @@ _LOST_CONNECTION = "Net Exception"
 
 class FrankaError(ArmSafetyError, RuntimeError):
     """The robot cannot be reached, refuses, or has ended the torque control."""
+
+
+class NoRealTimeError(FrankaError):
+    """The kernel is not for real time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +143,10 @@ class FrankaArm:
         if last:
             self._control = None
 
+    def close(self) -> None:
+        """Leave the robot, which holds itself then."""
+        self._control = self._robot = None
+
     def recover(self) -> None:
         """Reset the robot's errors, or connect again."""
         if self._robot is None:
@@ -163,7 +172,8 @@ class FrankaArm:
             if isinstance(error, (OSError, NetworkException)) or _LOST_CONNECTION in str(error):
                 self._robot = None
             said = " ".join(str(error).split()).removeprefix("libfranka: ")
-            raise FrankaError(said) from error
+            kind = NoRealTimeError if isinstance(error, RealtimeException) else FrankaError
+            raise kind(said) from error
 
 
 def _pose(columns: Sequence[float]) -> pin.SE3:

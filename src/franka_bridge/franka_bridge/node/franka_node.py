@@ -16,11 +16,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from franka_bridge.arm import Behaviour, FrankaArm, FrankaError, flange_pose
+from franka_bridge.arm import Behaviour, FrankaArm, FrankaError, NoRealTimeError, flange_pose
 from franka_bridge.node.franka_parameters import FrankaConfiguration, check_flange, make_drive
 from franka_bridge.node.topics import EXTERNAL_TORQUES, EXTERNAL_WRENCH_ESTIMATE, RECOVER
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.plausible import RESTART_GAP
+from viability_bounds_pkg.robot.description import inertia_beyond
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.commands import CommandStream
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
@@ -36,6 +37,12 @@ Array = NDArray[np.float64]
 
 _DEADLINE = 0.7
 """Share of a period after which the robot gets its torques without a command."""
+
+_TOOL_ERROR = 0.1
+"""By how much the masses of the hand may differ without a word, kg."""
+
+_STOP_TIMEOUT = 2.0
+"""How long the arm may take to come to rest at the end of the node, s."""
 
 
 class FrankaNode(ArmNode):
@@ -65,10 +72,20 @@ class FrankaNode(ArmNode):
             self._drive = make_drive(config)
             try:
                 self._arm = FrankaArm(config.robot_ip, config.real_time)
+            except NoRealTimeError as error:
+                allowed = f"false, where {error}"
+                raise SettingError("real_time", config.real_time, allowed) from error
             except FrankaError as error:
                 allowed = f"the address of a robot whose FCI is on ({error})"
                 raise SettingError("robot_ip", config.robot_ip, allowed) from error
-            check_flange(config, np.array(self._arm.state.q), flange_pose(self._arm.state))
+            state = self._arm.state
+            check_flange(config, np.array(state.q), flange_pose(state))
+        tool = inertia_beyond(config.urdf, config.flange_frame, config.locked).mass
+        if abs(tool - state.m_ee) > _TOOL_ERROR:
+            self.get_logger().warning(
+                f"the hand has {tool:.2f} kg in the URDF, {state.m_ee:.2f} kg in the robot's "
+                "settings: gravity is compensated for the latter; correct one of them"
+            )
         self._refused: Counter[str] = Counter()
         self._commands = CommandStream(
             config, self._refused, self.get_logger().warning, lambda tau: self._asked(tau)
@@ -181,23 +198,22 @@ class FrankaNode(ArmNode):
     def _answer(self) -> None:
         """End a period: send the torques of its command, or those of the stop law."""
         self._waits = False
-        commands, state = self._commands, self._arm.state
-        commands.proceed()
-        command = commands.acting
+        self._commands.proceed()
+        command = self._commands.acting
         self._braked += command is None
-        torque = self._drive.torque(
-            np.array(state.q),
-            np.array(state.dq),
-            command.tau if isinstance(command, TorqueCommand) else None,
-            commands.missed_in_row > 0,
-            np.array(state.tau_J_d),
-        )
+        tau = command.tau if isinstance(command, TorqueCommand) else None
         try:
-            self._arm.write(torque.tolist())
+            self._arm.write(self._torque(tau, self._commands.missed_in_row > 0))
         except FrankaError as error:
             self._tell(str(error))
         self._publish_external()
         self._next()
+
+    def _torque(self, command: Array | None, held: bool) -> list[float]:
+        """Return the torques to send for the last state."""
+        state = self._arm.state
+        q, v, applied = map(np.array, (state.q, state.dq, state.tau_J_d))
+        return self._drive.torque(q, v, command, held, applied).tolist()
 
     def _asked(self, tau: Array) -> Array:
         return self._drive.asked(np.array(self._arm.state.q), tau)
@@ -290,6 +306,21 @@ class FrankaNode(ArmNode):
         if commands.acting is None:
             return DiagnosticStatus.WARN, f"{control}: no commands", values
         return DiagnosticStatus.OK, "running", values
+
+    def destroy_node(self) -> None:
+        """Bring the arm to rest and end the torque control, too."""
+        arm = getattr(self, "_arm", None)
+        end, self._waits = time.monotonic() + _STOP_TIMEOUT, False
+        try:
+            while arm is not None and arm.controlled:
+                arm.read()
+                torque = self._torque(None, False)
+                arm.write(torque, self._drive.stop.at_rest or time.monotonic() > end)
+        except FrankaError as error:
+            self._tell(str(error))
+        if arm is not None:
+            arm.close()
+        super().destroy_node()
 
 
 def main(args: list[str] | None = None) -> int:

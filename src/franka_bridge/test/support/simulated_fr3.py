@@ -5,11 +5,25 @@ import subprocess
 import sys
 from contextlib import contextmanager
 from importlib.util import find_spec
+from pathlib import Path
 
 from viability_bounds_pkg.testing.executables import as_child
 
 INSTALLED = bool(find_spec("pylibfranka") and find_spec("franky_sim"))
 START = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)  # rad
+ASSETS = Path(find_spec("franky_sim").origin).parent / "assets" if INSTALLED else Path()
+VALUES = {
+    "robot_description": str(ASSETS / "fr3.urdf"),
+    "joints": [f"fr3_joint{j}" for j in range(1, 8)],
+    "base_frame": "fr3_link0",
+    "end_effector_frame": "fr3_hand_tcp",
+    "rate_hz": 1000.0,
+    "real_time": False,
+    "command_includes_gravity": False,
+    "acceleration_min": [-10.0, -3.0, -10.0, -10.0, -10.0, -10.0, -10.0],
+    "acceleration_max": [10.0, 3.0, 10.0, 10.0, 10.0, 10.0, 10.0],
+}
+"""Parameters of the node, but for the address."""
 
 
 class SimulatedFr3:
