@@ -59,13 +59,14 @@ class LimitMonitor:
         self._peak.fill(-np.inf)
         self._too_fast.fill(-np.inf)
 
-    def update(self, q: Array, v: Array, tau: Array) -> None:
+    def update(self, q: Array, v: Array, tau: Array, lead: float = 0.0) -> None:
         """Take one physics step into account.
 
         Args:
             q: positions, shape (n,), rad.
             v: velocities, shape (n,), rad/s.
             tau: torques of the motors, shape (n,), N m.
+            lead: time by which the positions are ahead of the velocities, s.
         """
         sample = self._sample
         values = sample[0]
@@ -75,7 +76,8 @@ class LimitMonitor:
         np.negative(values, out=sample[1])
         np.maximum(self._peak, sample, out=self._peak)  # a NaN stays
         if self._depends_on_q:
-            room = np.where(v > 0.0, self._q_max - q, q - self._q_min)
+            at = q - lead * v
+            room = np.where(v > 0.0, self._q_max - at, at - self._q_min)
             excess = np.abs(v) - speed_limits(room, self._v_max, *self._curve)
             np.maximum(self._too_fast, excess, out=self._too_fast)
 

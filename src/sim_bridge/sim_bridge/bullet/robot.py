@@ -15,7 +15,8 @@ to the same instant as v:
 
 so that (x, v) follows eq. (1) exactly, however many steps of however changing accelerations.
 x is the position that `BulletRobot.state` reports and `BulletRobot.reset` sets. Forces that
-depend on position, link poses and the limit monitor use q. A bound that x keeps for ever with
+depend on position, link poses and the limit monitor use q; but for speed limits that depend on
+position, which are those at x. A bound that x keeps for ever with
 deceleration a, v <= sqrt(2 a r) at distance r, is exceeded by q by
 
     q - q_max = -r + (h/2) v <= -r + (h/2) sqrt(2 a r) <= a h^2 / 8,
@@ -307,7 +308,8 @@ class BulletRobot(BulletBody):
                 self._v_before = before[1]
                 self._measure(*before, self._v)
             if self.monitor is not None:
-                self.monitor.update(self._q, self._v, self._motor_torque)
+                lead = 0.5 * self.physics_dt
+                self.monitor.update(self._q, self._v, self._motor_torque, lead)
 
     def _apply_friction(self, model: JointFriction, braking: bool) -> None:
         """Apply the torques of the motors, and friction together with the brakes."""

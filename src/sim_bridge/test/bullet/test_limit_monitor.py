@@ -76,3 +76,11 @@ def test_speeds_are_compared_with_the_limits_at_their_positions(q, v, excess):
     monitor.update(*INSIDE)
     np.testing.assert_allclose(monitor.max_velocity_violation, [excess, 0.0], atol=1e-12)
     assert monitor.violated == (excess != 0.0)
+
+
+def test_positions_that_are_ahead_of_velocities_are_taken_back_for_them():
+    monitor = LimitMonitor([-1.0], [2.0], [3.0], [10.0], [0.5], [5.0])
+    monitor.update(np.array([1.9 + 0.5 * 0.002]), np.array([0.5]), np.zeros(1), 0.002)
+    np.testing.assert_allclose(monitor.max_velocity_violation, 0.0, atol=1e-12)
+    monitor.update(np.array([1.9 + 0.5 * 0.002]), np.array([0.5]), np.zeros(1))
+    assert monitor.max_velocity_violation > 1e-3
