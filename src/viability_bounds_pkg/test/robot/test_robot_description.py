@@ -95,6 +95,14 @@ def test_packages_are_found_however_many_slashes():
         resolve_uri("package:///nothing/here.urdf")
 
 
+def test_a_package_of_python_holds_files_too(tmp_path, monkeypatch):
+    (tmp_path / "some_robot" / "assets").mkdir(parents=True)
+    (tmp_path / "some_robot" / "assets" / "arm.urdf").write_text("<robot name='a'/>")
+    monkeypatch.syspath_prepend(tmp_path)
+    found = resolve_uri("package://some_robot/assets/arm.urdf")
+    assert found == tmp_path / "some_robot" / "assets" / "arm.urdf"
+
+
 def test_rotors_of_a_parameter_file_reach_the_model(tmp_path):
     path = tmp_path / "robot.yaml"
 

@@ -2,8 +2,8 @@
 """Finds and reads URDF files.
 
 A URDF is named by a file path or by a ``package://`` URI. Packages are looked up where ROS 2
-looks (``AMENT_PREFIX_PATH``, ``ROS_PACKAGE_PATH``) and where the ``example-robot-data`` wheel
-puts its robots, so that one parameter file works with both.
+looks (``AMENT_PREFIX_PATH``, ``ROS_PACKAGE_PATH``), where the ``example-robot-data`` wheel puts
+its robots, and among Python's own packages, so that one parameter file works with all.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ def resolve_uri(uri: str) -> Path:
     """
     if uri.startswith("package://"):
         relative = uri.removeprefix("package://").lstrip("/")  # some write three
-        for directory in package_directories():
+        # Of Python's packages only files: an ament_python package has a folder there, too.
+        for directory in (*package_directories(), *map(Path, sys.path)):
             path = directory / relative
             if path.is_file():
                 return path
