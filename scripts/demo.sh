@@ -9,7 +9,8 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
                             [--view] [--record]
 
   robot        the name of a parameter file in config/, as baxter_left_arm (default), panda and
-               talos_left_arm, or the path of one; scripts/new_robot.sh makes one from a URDF
+               talos_left_arm, or the path of one; scripts/new_robot.sh makes one from a URDF; fr3
+               needs more, see docs/start/franka.md
   scenario     the name in config/scenarios/<robot>_<scenario>.yaml, beside the robot's file, or the
                path of a file, see docs/guides/simulation.md (default: demo; of a robot that has none, it
                holds its start posture for 2 s)
@@ -166,13 +167,25 @@ stop() {
 trap stop EXIT
 trap 'exit 130' INT TERM HUP
 
+# An arm that its maker's protocol connects is simulated by a program of its own.
+package=sim_bridge driver=bullet_node stack=simulated_stack
+simulated="$(sed -n 's/^ *robot_node: *\(simulated_\w*\).*/\1/p' "$config")"
+if [ -n "$simulated" ]; then
+    package=franka_bridge driver=franka_node stack=franka_stack
+    overrides+=(-p robot_ip:=127.0.0.1 -p real_time:=false)
+    start "$package" "$simulated"
+    until (exec 3<>/dev/tcp/127.0.0.1/1337) 2>/dev/null; do
+        kill -0 "${pids[0]}" 2>/dev/null || exit 2
+        sleep 0.1
+    done
+fi
 if [ -n "$processes" ]; then
     start viability_bounds_pkg bounds_node
     start torque_safety_controller controller_node
     [ -z "$imperfect" ] || start viability_bounds_pkg estimator_node
-    start sim_bridge bullet_node
+    start "$package" "$driver"
 else
-    start sim_bridge simulated_stack
+    start "$package" "$stack"
 fi
 [ -z "$view" ] || start sim_bridge viewer_node
 

@@ -18,7 +18,7 @@ import numpy as np
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from franka_bridge.node import topics as franka_topics
-from franka_bridge.node.franka_parameters import FrankaConfiguration
+from franka_bridge.node.franka_parameters import FrankaConfiguration, SimulationConfiguration
 from sim_bridge.node import topics as bullet_topics
 from sim_bridge.node.bullet_parameters import BulletConfiguration
 from sim_bridge.node.viewer_node import ViewerConfiguration
@@ -39,6 +39,7 @@ CONFIGURATIONS = {
     "controller_node": ControllerConfiguration,
     "bullet_node": BulletConfiguration,
     "franka_node": FrankaConfiguration,
+    "simulated_fr3": SimulationConfiguration,
     "scenario_node": ScenarioConfiguration,
     "viewer_node": ViewerConfiguration,
     "moveit_node": MoveitConfiguration,

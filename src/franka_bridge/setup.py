@@ -28,6 +28,7 @@ setup(
         "console_scripts": [
             "franka_node = franka_bridge.programs:franka_node",
             "franka_stack = franka_bridge.programs:franka_stack",
+            "simulated_fr3 = franka_bridge.programs:simulated_fr3",
         ],
     },
 )

@@ -54,6 +54,21 @@ def test_an_imperfect_robot_is_played_by_programs_of_their_own(tmp_path):
 
 
 @pytest.mark.long
+def test_a_robot_behind_its_makers_protocol_is_judged_by_itself(tmp_path):
+    pytest.importorskip("pylibfranka")
+    pytest.importorskip("franky_sim")
+    scenario = yaml.safe_load((ROOT / "config" / "scenarios" / "fr3_demo.yaml").read_text())
+    path = tmp_path / "first_goals.yaml"
+    path.write_text(yaml.safe_dump({"duration": 1.0, "events": scenario["events"][:2]}))
+    result = run_to_end("bash", DEMO, "fr3", path, "--out", tmp_path, timeout=DEADLINE)
+    assert result.returncode == 0, result.stdout + result.stderr
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["deadline_misses"] == 0
+    assert 0.1 < metrics["max_torque_rate_ratio"] <= 1.0
+    assert max(joint["max_speed_ratio"] for joint in metrics["joints"].values()) > 0.3
+
+
+@pytest.mark.long
 def test_a_signal_takes_down_all_of_it(tmp_path):
     long = tmp_path / "long.yaml"
     long.write_text("{duration: 20.0, events: []}")

@@ -167,6 +167,7 @@ KEYLESS = {name: name for name in ("daqp", "viser", "trimesh", "mcap")} | {
     "array_api_compat": "array-api-compat",
     "pylibfranka": "pylibfranka",
     "franky_sim": "franky-sim",
+    "mujoco": "mujoco",
 }
 """Modules without a key of rosdep; a comment tells what to install."""
 

@@ -22,6 +22,8 @@ NODES = (
     "estimator_node",
     "controller_node",
     "bullet_node",
+    "franka_node",
+    "simulated_fr3",
     "scenario_node",
     "viewer_node",
     "moveit_node",

@@ -38,6 +38,9 @@ Array = NDArray[np.float64]
 _DEADLINE = 0.7
 """Share of a period after which the robot gets its torques without a command."""
 
+_PATIENCE = 5.0
+"""The same in lockstep, with a simulated robot that waits for commands, s."""
+
 _TOOL_ERROR = 0.1
 """By how much the masses of the hand may differ without a word, kg."""
 
@@ -106,7 +109,8 @@ class FrankaNode(ArmNode):
         self.listen(JOINT_COMMANDS, self._on_command)
         self._loads = PayloadSubscriber(self, self._drive.payload, self._on_load)
         RECOVER.serve(self, self._on_recover)
-        self._deadline = steady_timer(self, _DEADLINE * self._config.dt, self._on_deadline)
+        patience = _PATIENCE if self._config.clock == "lockstep" else _DEADLINE * self._config.dt
+        self._deadline = steady_timer(self, patience, self._on_deadline)
         self._deadline.cancel()
         self._starter = steady_timer(self, self._config.dt, self._on_start)
         self._diagnostics = Diagnostics(self, self._report, self.publisher_watch)

@@ -13,6 +13,7 @@ from franka_bridge.drive import Drive
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.parameter import (
+    FINITE,
     NEGATIVE,
     POSITIVE,
     Range,
@@ -37,7 +38,7 @@ Array = NDArray[np.float64]
 
 JOINTS = 7
 RATE = 1000.0  # Hz
-_TORQUE_RATE = 1000.0
+TORQUE_RATE = 1000.0
 """libfranka's limit of torque rates, N m/s."""
 
 _FLANGE_ERROR = 2e-3
@@ -45,7 +46,28 @@ _FLANGE_ERROR = 2e-3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FrankaConfiguration(ControlRate, TorqueConvention, TaskFrames, LimitedRobotConfiguration):
+class Connection:
+    """Where a robot is, and whose time counts."""
+
+    robot_ip: str = text("address of the robot")
+    clock: str = text(
+        "real_time: by the wall clock; lockstep: each period waits for its command",
+        default="real_time",
+        choices=("real_time", "lockstep"),
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SimulationConfiguration(Connection, LimitedRobotConfiguration):
+    """Parameters of the simulated robot; arrays of shape (7,) in `joints` order."""
+
+    start_positions: Array = joint_numbers("positions at start and after reset, rad", FINITE)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrankaConfiguration(
+    Connection, ControlRate, TorqueConvention, TaskFrames, LimitedRobotConfiguration
+):
     """Parameters of the robot's node; arrays of shape (7,) in `joints` order.
 
     Attributes:
@@ -53,7 +75,6 @@ class FrankaConfiguration(ControlRate, TorqueConvention, TaskFrames, LimitedRobo
         model: of the arm.
     """
 
-    robot_ip: str = text("address of the robot")
     real_time: bool = switch(
         "libfranka refuses a kernel without PREEMPT_RT; false for a simulated robot", default=True
     )
@@ -67,9 +88,9 @@ class FrankaConfiguration(ControlRate, TorqueConvention, TaskFrames, LimitedRobo
     acceleration_max: Array = joint_numbers("upper acceleration limits, rad/s^2", POSITIVE)
     torque_rate_max: Array = joint_numbers(
         "limits of the torque rate, N m/s; those of libfranka if empty",
-        above(0.0, _TORQUE_RATE),
+        above(0.0, TORQUE_RATE),
         default=(),
-        if_empty=_TORQUE_RATE,
+        if_empty=TORQUE_RATE,
     )
     collision_torque: Array = numbers(
         "external torques at which the robot stops, N m",

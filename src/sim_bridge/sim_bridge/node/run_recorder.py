@@ -71,6 +71,7 @@ class RunRecorder:
         joints: joints to record, in this order.
         continuous: see `JointStateReader`; recorded without leaps.
         file: to which all messages go, too, as they came; None for none.
+        robot: name of the robot's node.
 
     Attributes:
         topics: names of those recorded.
@@ -87,12 +88,13 @@ class RunRecorder:
         joints: Sequence[str],
         continuous: NDArray[np.bool_],
         file: McapFile | None = None,
+        robot: str = "bullet_node",
     ) -> None:
         self._unfiled: list[tuple[str, bytes]] = []
         self.stamp = self.answered = -1
         self.q: Array = np.zeros(len(joints))
         self.diagnostics: dict[str, dict[str, str]] = {
-            name: {} for name in ("bullet_node", "controller_node", "bounds_node")
+            name: {} for name in (robot, "controller_node", "bounds_node")
         }
         namespace = node.get_namespace().strip("/")
         self._senders = {

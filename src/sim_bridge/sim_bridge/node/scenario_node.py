@@ -50,11 +50,8 @@ from viability_bounds_pkg.ros.runtime import make_executor, steady_timer
 
 _POLL_PERIOD = 0.02
 _SHOW_PERIOD = 0.5
-_REFUSAL_COUNTS: dict[str, tuple[str, str | tuple[str, ...]]] = {
-    "controller_node": ("goals_refused", "target_"),
-    "bullet_node": ("commands_refused", ("external_wrench", "obstacles")),
-}
-"""By node, the diagnostics key that counts refusals by topic, and the topics of a scenario."""
+_LEAD = 1.0
+"""Time before the first goal on a robot that cannot pause: its messages arrive meanwhile, s."""
 
 
 class ScenarioRefused(ArmSafetyError, RuntimeError):
@@ -64,7 +61,8 @@ class ScenarioRefused(ArmSafetyError, RuntimeError):
 class ScenarioNode(ArmNode):
     """Resets a paused robot, plays a scenario on it, and records the run.
 
-    Goals, pushes and obstacles are sent before their time with the stamps at which they
+    A robot whose diagnostics tell nothing of pauses is neither reset nor paused. Goals, pushes and
+    obstacles are sent before their time with the stamps at which they
     take effect. In lockstep the robot is paused where a service must be called, until it has
     answered; so a run in lockstep is the same each time.
 
@@ -90,7 +88,9 @@ class ScenarioNode(ArmNode):
         self.awaits = ""
         self.ended: Future[None] = Future()
         self.failure: ScenarioRefused | None = None
-        self.recorder = RunRecorder(self, config.joints, config.continuous, file)
+        self.recorder = RunRecorder(
+            self, config.joints, config.continuous, file, config.robot_node
+        )
         self._first, self._period = 0, 1
         self._refused: dict[str, list[str]] | None = None  # when the messages begin; else None
         frames = config.base_frame, config.end_effectors[0]
@@ -98,7 +98,7 @@ class ScenarioNode(ArmNode):
             self, "controller_node", to_controller(config.plan, *frames)
         )
         self._world = ScheduledPublisher(
-            self, "bullet_node", to_robot(config.plan, config.base_frame)
+            self, config.robot_node, to_robot(config.plan, config.base_frame)
         )
         self._due = deque(e for e in config.plan.events if isinstance(e, ServiceEvent))
         own = RESET, pause(False), change_parameters("bullet_node", {})
@@ -106,17 +106,29 @@ class ScenarioNode(ArmNode):
             request.service: self.create_client(request.kind, request.service)
             for request in (*own, *map(to_service, self._due))
         }
+        self._of_pauses = {request.service for request in own}
         self._course = self._play()
         steady_timer(self, _POLL_PERIOD, self._proceed)
 
     @property
     def robot(self) -> dict[str, str]:
         """The robot's last diagnostics, by key."""
-        return self.recorder.diagnostics["bullet_node"]
+        return self.recorder.diagnostics[self.config.robot_node]
+
+    @property
+    def _pauses(self) -> bool:
+        """Whether the robot can be reset and paused."""
+        return "paused" in self.robot or not self.robot
+
+    @property
+    def _duration(self) -> int:
+        """Control periods that the scenario lasts."""
+        return round(1e9 * self.config.plan.duration / self._period)
 
     def recorded_run(self) -> RecordedRun:
         """Return the recording since the robot began to move."""
-        return self.recorder.run(self._first, self._period, int(self.robot["periods"]))
+        played = int(self.robot["periods"]) if self._pauses else self._duration
+        return self.recorder.run(self._first, self._period, played)
 
     # Course of the scenario
 
@@ -136,6 +148,9 @@ class ScenarioNode(ArmNode):
         """Play the scenario; yield what must happen before it proceeds."""
         while missing := self._missing():
             yield f"getting ready: there is no {', no '.join(missing)}"
+        if not self._pauses:
+            yield from self._play_through()
+            return
         before = self._first = self.recorder.stamp
         yield from self._call(RESET)
         while not self.recorder.answered == self.recorder.stamp > before:
@@ -148,7 +163,7 @@ class ScenarioNode(ArmNode):
         while not self._load():
             yield "loading: there is no report that the messages of the scenario were received"
         lockstep = self.robot["clock"] == "lockstep"
-        begin, end = 0, round(1e9 * self.config.plan.duration / self._period)
+        begin, end = 0, self._duration
         while begin < end:
             yield from self._call_services(begin)
             # In lockstep the robot pauses where a service is due.
@@ -163,17 +178,32 @@ class ScenarioNode(ArmNode):
                 yield "playing"
             begin = halt
 
+    def _play_through(self) -> Iterator[str]:
+        """Play on a robot that goes on by itself; its messages are sent before the first goal."""
+        self._period = round(1e9 * float(self.robot["period_s"]))
+        lead = round(1e9 * _LEAD / self._period)
+        self._first = self.recorder.stamp + lead * self._period
+        self._refused = {}
+        self._check_refusals(self._refused)
+        loaded, now = False, -lead
+        while now < self._duration:
+            loaded = loaded or self._load()
+            yield from self._call_services(now)
+            yield "playing"
+            now = (self.recorder.stamp - self._first) // self._period
+
     def _stop(self) -> Iterator[str]:
-        """Pause the robot if the scenario has begun, and end."""
-        if self._refused is not None:
+        """Pause the robot if the scenario has begun and it can, and end."""
+        if self._refused is not None and self._pauses:
             yield from self._call(pause(True))
 
     def _missing(self) -> list[str]:
         """Return what is missing before the scenario can begin."""
-        clients = self._service_clients.items()
+        unused = set() if self._pauses else self._of_pauses
+        clients = [each for each in self._service_clients.items() if each[0] not in unused]
         topics = self._goals.without_subscriber() + self._world.without_subscriber()
         return (
-            ([] if self.robot.get("paused") == "True" else ["paused robot"])
+            (["paused robot"] if self._pauses and self.robot.get("paused") != "True" else [])
             + ([] if self.recorder.answered >= 0 else ["joint commands"])
             + [f"service {name}" for name, client in clients if not client.service_is_ready()]
             + [f"subscriber of {topic}" for topic in topics]
@@ -219,7 +249,11 @@ class ScenarioNode(ArmNode):
             raise ScenarioRefused(f"{trouble}; allowed: one")
 
     def _check_refusals(self, known: dict[str, list[str]]) -> None:
-        for node, (key, topics) in _REFUSAL_COUNTS.items():
+        # By node: the key of diagnostics that counts refusals by topic, and a scenario's topics.
+        for node, key, topics in (
+            ("controller_node", "goals_refused", "target_"),
+            (self.config.robot_node, "commands_refused", ("external_wrench", "obstacles")),
+        ):
             counts = self.recorder.diagnostics[node].get(key, "").split("; ")
             refused = [count for count in counts if count.startswith(topics)]
             if refused != known.setdefault(node, refused):

@@ -27,7 +27,7 @@ EXTERNAL_WRENCH = Topic(
     WrenchStamped,
     GOAL_QOS,
     (USER, "scenario_node", "viewer_node"),
-    (_NODE,),
+    (_NODE, "simulated_fr3"),
     "push on the link `frame_id` at its origin, in world axes, N and N m",
 )
 CLOCK = Topic(

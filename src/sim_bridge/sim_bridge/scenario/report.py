@@ -169,7 +169,7 @@ def _metrics(
     diagnostics: Mapping[str, Mapping[str, str]],
 ) -> Metrics:
     robot, bounds, controller = (
-        diagnostics[name] for name in ("bullet_node", "bounds_node", "controller_node")
+        diagnostics[name] for name in (config.robot_node, "bounds_node", "controller_node")
     )
     worst = np.nan  # distance to a trajectory while it lasted
     for event in config.plan.events:
@@ -179,7 +179,9 @@ def _metrics(
     position = _floats(robot, "position_violation_rad")
     velocity = _floats(robot, "velocity_violation_rad_s")
     ratio = max(float(robot["commanded_torque_ratio_max"]), _floats(robot, "torque_ratio").max())
+    rate = _floats(robot, "torque_rate_ratio").max() if "torque_rate_ratio" in robot else None
     kept = position.max() <= TOLERANCE and velocity.max() <= TOLERANCE and ratio <= 1.0 + TOLERANCE
+    kept = kept and (rate is None or rate <= 1.0 + TOLERANCE)
     return {
         "robot": config.robot_name,
         "bounds_method": bounds.get("method", "unknown"),
@@ -199,6 +201,7 @@ def _metrics(
             run.joints[int(np.argmax(velocity))] if velocity.max() > TOLERANCE else None
         ),
         "max_torque_ratio": float(ratio),
+        "max_torque_rate_ratio": None if rate is None else _or_none(rate),
         "final_position_error_m": _or_none(errors[-1, 0]),
         "final_orientation_error_rad": _or_none(errors[-1, 1]),
         "max_trajectory_error_m": _or_none(worst),
@@ -274,13 +277,14 @@ def verdict(metrics: Metrics) -> str:
         metrics: as in ``metrics.json``.
     """
     q, v = metrics["max_position_violation_rad"], metrics["max_velocity_violation_rad_s"]
-    tau = metrics["max_torque_ratio"]
+    tau, rate = metrics["max_torque_ratio"], metrics["max_torque_rate_ratio"] or 0.0
     unit = {name: row["unit"] for name, row in metrics["joints"].items()}
     beyond, fast = metrics["most_violated_joint"], metrics["most_too_fast_joint"]
     broken = {
         f"position by {q:.4g} {unit.get(beyond)} ({beyond})": q > TOLERANCE,
         f"speed by {v:.4g} {unit.get(fast)}/s ({fast})": v > TOLERANCE,
         f"torque, {tau:.4g} of its limit": tau > 1.0 + TOLERANCE,
+        f"torque rate, {rate:.4g} of its limit": rate > 1.0 + TOLERANCE,
     }
     said = "no limit was broken, at any physics step"
     if not metrics["limits_kept"]:

@@ -49,6 +49,10 @@ class ScenarioConfiguration(TaskFrames, LimitedRobotConfiguration):
 
     robot_name: str = text("name of the robot in the report", default="robot")
     scenario: str = text("YAML file of the scenario")
+    robot_node: str = text(
+        "node that simulates the robot, and reports whether it kept its limits",
+        default="bullet_node",
+    )
     ready_timeout: float = timeout("how long the other nodes may take to start, s", default=180.0)
     urdf: str = field(init=False)
     plan: Scenario = field(init=False)

@@ -15,7 +15,7 @@ from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
 N = len(JOINTS)
 TORQUE_MAX = np.array(VALUES["torque_max"])
-ROBOTS = sorted(path.stem for path in config_folder().glob("*.yaml"))
+ROBOTS = sorted(path.stem for path in (config_folder() / "imperfect").glob("*.yaml"))
 EVERYTHING = {
     "encoder_resolution": [1e-4] * N,
     "position_noise": [1e-5] * N,

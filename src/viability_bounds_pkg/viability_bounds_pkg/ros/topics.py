@@ -112,7 +112,7 @@ JOINT_STATES = Topic(
     JointState,
     CONTROL_QOS,
     ("bullet_node", "franka_node"),
-    ("bounds_node", "controller_node", "estimator_node", "scenario_node"),
+    ("bounds_node", "controller_node", "estimator_node", "simulated_fr3", "scenario_node"),
     "positions, rad, and velocities, rad/s; `effort` is the motors' torque, N m; any order; "
     "further joints are ignored",
 )
@@ -195,7 +195,14 @@ DIAGNOSTICS = Topic(
     "/diagnostics",
     DiagnosticArray,
     STATUS_QOS,
-    ("bounds_node", "estimator_node", "controller_node", "bullet_node", "franka_node"),
+    (
+        "bounds_node",
+        "estimator_node",
+        "controller_node",
+        "bullet_node",
+        "franka_node",
+        "simulated_fr3",
+    ),
     ("scenario_node", "viewer_node"),
     "mode and reason, refused messages, margins, latency, closest approach; a status has the "
     "name of its node, as `left/bullet_node`",
