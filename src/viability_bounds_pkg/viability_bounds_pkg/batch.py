@@ -154,8 +154,8 @@ def _along_speed_limit(xp: Any, room: Array, v: Array, limit: _Limit) -> Array:
     moves = (v > 0.0) & (limit.offset > 0.0)
     c, d = xp.where(moves, limit.offset, 1.0), 0.5 * limit.twice_braking
     v = xp.where(moves, v, 1.0)
-    # More than zero, so that its root has a derivative.
-    slack = xp.clip(2.0 * d * room - v * (v + 2.0 * c), 1e-30, None) / v
+    # Neither zero nor infinite, so that its root has a derivative.
+    slack = xp.clip(2.0 * d * room - v * (v + 2.0 * c), 1e-30, 1e15) / v
     a = 2.0 * d * v / (slack + 2.0 * (v + c) + xp.sqrt(slack * (slack + 4.0 * c)))
     return xp.where((v - a * limit.dt) * (d - a) <= a * c, -a, xp.inf)
 

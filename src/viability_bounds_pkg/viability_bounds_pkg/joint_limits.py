@@ -122,7 +122,8 @@ class JointLimits:
         Returns:
             Two arrays of the shape of `q`, rad/s.
         """
-        rooms = np.stack([q - self.q_min, self.q_max - q])
+        at = np.asarray(q, dtype=np.float64)
+        rooms = np.stack([at - self.q_min, self.q_max - at])
         lower, upper = speed_limits(
             rooms, self.v_max, self.velocity_offset, self.deceleration_limit
         )

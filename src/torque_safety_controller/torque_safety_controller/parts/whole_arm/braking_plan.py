@@ -322,8 +322,8 @@ class PlanTorques:
             periods: shape (plans, n).
             extra: torque that the motors give besides that of the model, shape (n,), N m.
         """
-        q_min, q_max, tolerance, _, *others = self._limits
-        *states, beyond = sample(q, v, periods, q_min, q_max, tolerance, *others)
+        q_min, q_max, tolerance, _, dt, c, d = self._limits
+        *states, beyond = sample(q, v, periods, q_min, q_max, tolerance, dt, c, d)
         samples = Samples(*states)
         n = q.size
         tau = np.empty_like(samples.q)

@@ -250,8 +250,10 @@ class SafetyFilter(Part):
         self._most_beyond = float(plans.beyond[chosen])
         self.plan = plans.samples.a[chosen, FIRST]
         self.rest_torque = plans.tau[chosen, AT_REST]
-        q_min, q_max, _, *others = self._limits
-        self.lower, self.upper = narrow(q, v, self.plan, lower, upper, q_min, q_max, *others)
+        q_min, q_max, _, braking, dt, c, d = self._limits
+        self.lower, self.upper = narrow(
+            q, v, self.plan, lower, upper, q_min, q_max, braking, dt, c, d
+        )
         most = float((plans.peaks[chosen] * self._of_limit).max())
         self.lost = not most <= 1.0 + LOST
         return self._rows(plans, chosen) if most <= 1.0 else None
