@@ -122,3 +122,12 @@ def test_meshes_of_the_package_around_a_urdf_are_found(tmp_path, monkeypatch):
     assert f"file://{folder}/meshes/a.stl" in read_urdf(str(path))
     monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path))  # as if it was installed
     assert "package://described/meshes/a.stl" in read_urdf(str(path))
+
+
+def test_meshes_beside_a_urdf_are_found(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "a.stl").touch()
+    path = tmp_path / "arm.urdf"
+    path.write_text(f'{ROBOT}<!-- <mesh filename="meshes/a.stl"/> <mesh filename="b.stl"/> -->')
+    found = f'<mesh filename="file://{tmp_path}/meshes/a.stl"/> <mesh filename="b.stl"/>'
+    assert found in read_urdf(str(path))

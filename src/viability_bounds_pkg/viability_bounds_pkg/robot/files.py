@@ -97,9 +97,10 @@ def _declared_name(folder: Path) -> str:
 
 
 def with_near_packages(text: str, path: Path) -> str:
-    """Return a URDF with ``package://`` URIs of packages around or beside its file as files.
+    """Return a URDF with names of meshes that depend on its place made absolute.
 
-    A package that is installed keeps them.
+    These are names relative to its folder, and ``package://`` URIs of packages around or beside
+    its file; a package that is installed keeps them.
     """
 
     def place(uri: re.Match[str]) -> str:
@@ -110,6 +111,11 @@ def with_near_packages(text: str, path: Path) -> str:
         except RobotDescriptionError:
             return uri[0]
 
+    def beside(name: re.Match[str]) -> str:
+        file = path.parent.resolve() / name[1]
+        return f'filename="file://{file}"' if file.is_file() else name[0]
+
+    text = re.sub(r'filename="(?![a-z]+://|/)([^"]+)"', beside, text)
     return re.sub(r"package:///*([\w.-]+)/", place, text)
 
 
