@@ -24,6 +24,9 @@ _PATIENCE = 0.5
 
 _POLL = 5e-5  # s
 
+_LEAVE_TIMEOUT = 3.0
+"""How long a client may take to leave at the end, s."""
+
 _HOLDING = {"kp": (2000.0,) * 4 + (500.0,) * 3, "kv": (100.0,) * 4 + (20.0,) * 3}
 """Gains that hold the arm without torque control: franky-sim's need friction in the joints."""
 
@@ -136,7 +139,10 @@ class SimulatedArm:
         data.xfrc_applied[body] = [*force, *torque]
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop listening when the client has left, which may bring the arm to rest before."""
+        self._waits, end = False, time.monotonic() + _LEAVE_TIMEOUT
+        while self._server.tcp_connected and time.monotonic() < end:
+            self.step()
         self._server.cleanup()
         self._simulator.cleanup()
 

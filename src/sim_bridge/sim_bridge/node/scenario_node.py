@@ -204,6 +204,7 @@ class ScenarioNode(ArmNode):
         topics = self._goals.without_subscriber() + self._world.without_subscriber()
         return (
             (["paused robot"] if self._pauses and self.robot.get("paused") != "True" else [])
+            + ([] if self.recorder.stamp >= 0 else ["joint states"])
             + ([] if self.recorder.answered >= 0 else ["joint commands"])
             + [f"service {name}" for name, client in clients if not client.service_is_ready()]
             + [f"subscriber of {topic}" for topic in topics]
