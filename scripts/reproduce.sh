@@ -17,7 +17,7 @@ Writes figures to results/ and tables to docs/results.md, and prints the tables.
                      two cores)
   imperfect panda    one of the robots
   contrast           the moving picture of README
-  theory             figures and tables of the pages under docs/theory (3 min)
+  theory             figures and tables of the pages under docs/theory (4 min)
   soak               faults while the arm moves: restarts, wrong states, second nodes (3 min)
   all                the first four (default)
 USAGE
