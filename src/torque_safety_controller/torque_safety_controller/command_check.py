@@ -8,8 +8,9 @@ disturbance: nothing is to be learned from it.
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -35,15 +36,15 @@ class CommandCheck:
     """
 
     def __init__(self, tolerance: Array, reach: int) -> None:
-        self._tolerance = tolerance
-        self._sent = np.zeros((reach, tolerance.size))
-        _within(tolerance, self._sent, tolerance)  # compiled before states come
+        self._tolerance = tolerance.tolist()
+        self._sent: deque[list[float]] = deque(maxlen=reach)
         self.times = 0
         self.reset()
 
     def reset(self) -> None:
         """Forget all commands."""
-        self._count = self._agreed = self._in_row = 0
+        self._sent.clear()
+        self._agreed = self._in_row = 0
 
     @property
     def ignored(self) -> bool:
@@ -52,10 +53,7 @@ class CommandCheck:
 
     def sent(self, tau: Array) -> None:
         """Record the command that answers a state, shape (n,), N m."""
-        if self._count == 0:
-            self._sent[:] = tau
-        self._sent[self._count % len(self._sent)] = tau
-        self._count += 1
+        self._sent.append(tau.tolist())
 
     def agrees(self, effort: Array) -> bool:
         """Return whether a torque agrees with the commands, or it is not known yet whether it may.
@@ -63,9 +61,11 @@ class CommandCheck:
         Args:
             effort: reported, shape (n,), N m.
         """
-        if self._count == 0:
+        if not self._sent:
             return True
-        if _within(effort, self._sent, self._tolerance):
+        # Lists are faster than arrays for so few numbers.
+        joints = zip(effort.tolist(), self._tolerance, zip(*self._sent, strict=True), strict=True)
+        if all(min(sent) - most <= tau <= max(sent) + most for tau, most, sent in joints):
             self._agreed += 1
             self._in_row = 0
             return True
@@ -75,13 +75,3 @@ class CommandCheck:
         self._in_row += 1
         self.times += self._in_row == IGNORED_AFTER
         return False
-
-
-@njit(cache=True)
-def _within(effort: Array, sent: Array, tolerance: Array) -> bool:
-    """Return whether torques, shape (n,), are in the range of others, shape (k, n)."""
-    for j in range(effort.size):
-        low, high = sent[:, j].min() - tolerance[j], sent[:, j].max() + tolerance[j]
-        if not low <= effort[j] <= high:
-            return False
-    return True

@@ -83,7 +83,7 @@ class Disturbance(Part):
             time = self._time_constant
             gain = -math.expm1(-elapsed / time) if time > 0.0 else 1.0
             change = (v - self._v_last) / elapsed - a_last
-            self.estimate = _updated(self.estimate, change, gain, self._zero, tau_max, M)
+            self.estimate = _updated(self.estimate, change, gain, tau_max, M)
         self._v_last = v.copy()
 
     def expect(self, torque: Array, tau_max: Array, M: Array) -> None:
@@ -97,27 +97,23 @@ class Disturbance(Part):
         """
         if torque.any() and math.isfinite(torque.dot(torque)):
             with suppress(ValueError):  # of NumPy's, where M is no mass matrix
-                self.estimate = _updated(self.estimate, self._zero, 0.0, torque, tau_max, M)
+                expected = self.estimate + np.linalg.solve(M, torque)
+                self.estimate = _updated(expected, self._zero, 0.0, tau_max, M)
 
 
 @njit(cache=True)
-def _updated(
-    old: Array, observed: Array, gain: float, torque: Array, tau_max: Array, M: Array
-) -> Array:
-    """Return the estimate with what was observed and what a torque adds, within motors' limits.
+def _updated(old: Array, observed: Array, gain: float, tau_max: Array, M: Array) -> Array:
+    """Return the estimate with what was observed, within motors' limits.
 
     Args:
         old: estimate, shape (n,), rad/s^2.
         observed: difference of accelerations, shape (n,), rad/s^2; a NaN resets the estimate.
         gain: share of it that the filter takes; 0 for nothing observed.
-        torque: what is added to that of the last step, shape (n,), N m.
         tau_max: torque limits, shape (n,), N m.
         M: mass matrix, shape (n, n), kg m^2.
     """
-    estimate = old + gain * (observed - old)
-    if torque.any():
-        estimate += np.linalg.solve(M, torque)
-    for j in range(estimate.size):
-        e, most = estimate[j], tau_max[j] / M[j, j]
+    estimate = np.empty_like(old)
+    for j in range(old.size):
+        e, most = old[j] + gain * (observed[j] - old[j]), tau_max[j] / M[j, j]
         estimate[j] = min(max(e, -most), most) if e == e and most > 0.0 else 0.0
     return estimate
