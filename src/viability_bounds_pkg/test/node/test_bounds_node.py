@@ -9,6 +9,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
+from viability_bounds_pkg import uncertainty
 from viability_bounds_pkg.baselines import naive_bounds
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_node import BoundsNode
@@ -219,6 +220,17 @@ def test_method_and_horizon_change_while_it_runs(ros):
     for name, value in (("bounds_dt_factor", 0.99), ("method", "guess"), ("rate_hz", 1e3)):
         ros.refuses(NODE, **{name: value})
     check(robot.ask(4 * ELSEWHERE, q, v), exact(q, v, 1.0))
+
+
+def test_bounds_are_prepared_once_for_each_change(ros, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        uncertainty, "BoundsSolver", lambda *a, **k: made.append(1) or BoundsSolver(*a, **k)
+    )
+    ros.start(BoundsNode, VALUES)
+    assert len(made) == 1
+    ros.accepts(NODE, bounds_dt_factor=3.0)
+    assert len(made) == 2
 
 
 def test_a_horizon_that_is_too_long_for_the_limits_is_shortened(shared_ros):

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -144,8 +144,9 @@ Bounds = Callable[[Array, Array], viability.AccelerationBounds]
 """Computes the bounds from positions and velocities."""
 
 
+@lru_cache(maxsize=1)
 def make_solver(config: BoundsConfiguration) -> viability.BoundsSolver:
-    """Return the exact bounds.
+    """Return the exact bounds, the same ones again for the same configuration.
 
     Raises:
         SettingError: declarations, or a control rate, that leave no bounds.
