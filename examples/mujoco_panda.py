@@ -96,7 +96,7 @@ def drive(method: str = "exact", duration: float = DURATION, seed: int = 0) -> E
         tau = controller.step(State(q, v), AccelerationRange(limits.lower, limits.upper)).tau
         data.qfrc_applied[:] = tau
         mujoco.mj_forward(arm, data)
-        apart = np.abs(data.qacc - pin.aba(model, robot.data, q, v, tau)).max()
+        apart = np.abs(data.qacc - pin.aba(model, model.createData(), q, v, tau)).max()
         for _ in range(STEPS):
             mujoco.mj_step(arm, data)
             q, v = data.qpos, data.qvel

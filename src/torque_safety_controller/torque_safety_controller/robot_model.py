@@ -19,38 +19,62 @@ _LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class FrameModel:
-    """Kinematics of one frame, such as an end effector, at the current state.
+    """Kinematics of one frame, such as an end effector, at the current state of an arm.
+
+    Pose, Jacobian and drift are computed when one of them is read for the first time in a step.
+
+    Args:
+        robot: the arm.
+        frame: name of the frame.
 
     Attributes:
-        frame: its name.
-        v: velocity of the joints, shape (n,), rad/s.
-        a_last: acceleration of the joints commanded last, shape (n,), rad/s^2.
-        pose: placement in the root frame of the URDF.
-        J: its Jacobian in its own axes, shape (6, n), linear rows first.
-        drift: its acceleration at zero joint acceleration, J' v, shape (6,).
-        J_dot: time derivative of J, shape (6, n).
+        frame: as given.
+        known: whether `pose`, `J` and `drift` are those of the current state.
+
+    Raises:
+        RobotDescriptionError: no such frame.
     """
 
-    def __init__(self, model: pin.Model, frame: str) -> None:
-        self._frame_id = frame_id(model, frame)
-        self.frame = frame
-        self.v: Array = np.zeros(model.nv)
-        self.a_last: Array = self.v
-        self.pose = pin.SE3.Identity()
-        self.J = np.zeros((6, model.nv))
-        self.drift = np.zeros(6)
-        self.J_dot = np.zeros((6, model.nv))
+    def __init__(self, robot: RobotModel, frame: str) -> None:
+        self._robot, self._frame_id = robot, frame_id(robot.model, frame)
+        self.frame, self.known = frame, False
+        robot.frames.append(self)
 
-    def read(self, model: pin.Model, data: pin.Data) -> None:
-        """Take pose, Jacobian and drift from `data`, which has the kinematics of the state."""
-        frame = self._frame_id
-        self.pose = pin.updateFramePlacement(model, data, frame)
-        self.J = pin.getFrameJacobian(model, data, frame, _LOCAL)
-        self.drift = pin.getFrameAcceleration(model, data, frame, _LOCAL).vector
+    @property
+    def pose(self) -> pin.SE3:
+        """Placement in the root frame of the URDF."""
+        if not self.known:
+            self._read()
+        return self._pose
 
-    def read_rate(self, model: pin.Model, data: pin.Data) -> None:
-        """Take the time derivative of the Jacobian from `data`."""
-        self.J_dot = pin.getFrameJacobianTimeVariation(model, data, self._frame_id, _LOCAL)
+    @property
+    def J(self) -> Array:
+        """Jacobian in the frame's own axes, shape (6, n), linear rows first."""
+        if not self.known:
+            self._read()
+        return self._J
+
+    @property
+    def drift(self) -> Array:
+        """Acceleration at zero joint acceleration, J' v, shape (6,)."""
+        if not self.known:
+            self._read()
+        return self._drift
+
+    @property
+    def J_dot(self) -> Array:
+        """Time derivative of J, shape (6, n), computed when it is read."""
+        robot, data = self._robot, self._robot.data
+        pin.computeJointJacobiansTimeVariation(robot.model, data, robot.q, robot.v)
+        J_dot: Array = pin.getFrameJacobianTimeVariation(robot.model, data, self._frame_id, _LOCAL)
+        return J_dot
+
+    def _read(self) -> None:
+        model, data, frame = self._robot.model, self._robot.data, self._frame_id
+        self._pose = pin.updateFramePlacement(model, data, frame)
+        self._J: Array = pin.getFrameJacobian(model, data, frame, _LOCAL)
+        self._drift: Array = pin.getFrameAcceleration(model, data, frame, _LOCAL).vector
+        self.known = True
 
 
 class RobotModel(FrameModel):
@@ -73,15 +97,14 @@ class RobotModel(FrameModel):
         others: names of the frames of further end effectors.
 
     Attributes:
-        q: position, shape (n,), rad.
+        q: position, shape (n,), rad; a copy of the state's, and written again by each update.
+        v: velocity, shape (n,), rad/s; likewise.
+        a_last: acceleration commanded last, shape (n,), rad/s^2.
         others: the further end effectors.
+        frames: all frames that follow the arm, itself the first.
         payload: that the masses of the model include.
         M: mass matrix in the middle of the step, shape (n, n), kg m^2.
         h: Coriolis, centrifugal and gravity torques there, shape (n,), N m.
-        C: Coriolis matrix there, M' - 2 C skew-symmetric, shape (n, n), N m s; with `rates`.
-        rates: whether `update` computes C and J_dot; else they are old.
-        data: Pinocchio's; after `update` with the kinematics and joint Jacobians of the current
-            state, at zero acceleration.
 
     Raises:
         RobotDescriptionError: no such frame.
@@ -90,67 +113,70 @@ class RobotModel(FrameModel):
     def __init__(
         self, model: pin.Model, frame: str, dt: float, others: Sequence[str] = ()
     ) -> None:
-        super().__init__(model, frame)
-        self.others = tuple(FrameModel(model, each) for each in others)
-        self.model = model
+        self.model, self.dt, self.n = model, dt, model.nv
+        self.frames: list[FrameModel] = []
+        super().__init__(self, frame)
+        self.others = tuple(FrameModel(self, each) for each in others)
         self.payload = Payload(model)
-        self.dt = dt
-        self.n = model.nv
-        self.data = model.createData()
         self._zero = np.zeros(self.n)
+        self.q, self.v, self.a_last = np.zeros(self.n), np.zeros(self.n), self._zero
         self._middle = np.zeros(self.n), np.zeros(self.n)
-        self.q: Array = self._zero
+        self._held = np.zeros(self.n), np.zeros(self.n)
+        # Apart, as what is computed of the middle of a step would overwrite its beginning.
+        self._kinematics, self._dynamics = model.createData(), model.createData()
+        self._placed = False
         self.M = np.eye(self.n)
         self.h = np.zeros(self.n)
-        self.C = np.zeros((self.n, self.n))
-        self.rates = False
+
+    @property
+    def data(self) -> pin.Data:
+        """Pinocchio's, with kinematics and joint Jacobians of the state, at zero acceleration."""
+        if not self._placed:
+            pin.forwardKinematics(self.model, self._kinematics, self.q, self.v, self._zero)
+            pin.computeJointJacobians(self.model, self._kinematics)  # of its positions
+            self._placed = True
+        return self._kinematics
+
+    @property
+    def C(self) -> Array:
+        """Coriolis matrix in the middle of the step, computed when it is read.
+
+        Shape (n, n), N m s; M' - 2 C is skew-symmetric.
+        """
+        C: Array = pin.computeCoriolisMatrix(self.model, self._dynamics, *self._middle)
+        return C
 
     def update(self, state: State, a_last: Array) -> None:
-        """Compute everything for one control step.
+        """Compute the dynamics of one control step; what follows the state is computed when read.
 
         Args:
             state: of the n joints.
             a_last: acceleration commanded last, shape (n,), rad/s^2.
         """
-        model, data = self.model, self.data
-        q, v = self.q, self.v = state
         self.a_last = a_last
         q_mid, v_mid = self._middle
-        _middle_of_step(q, v, a_last, self.dt, q_mid, v_mid)
-        self.M = pin.crba(model, data, q_mid)
-        self.h = pin.nonLinearEffects(model, data, q_mid, v_mid)
-        if self.rates:
-            self.C = pin.computeCoriolisMatrix(model, data, q_mid, v_mid)
-        # Last, because the kinematics in `data` are to be those of the current state.
-        if self.rates:
-            pin.computeJointJacobiansTimeVariation(model, data, q, v)
-            self.read_rate(model, data)
-            for hand in self.others:
-                hand.read_rate(model, data)
-        pin.forwardKinematics(model, data, q, v, self._zero)
-        if not self.rates:
-            pin.computeJointJacobians(model, data)  # of the positions in `data`
-        self.read(model, data)
-        for hand in self.others:
-            hand.v, hand.a_last = v, a_last
-            hand.read(model, data)
+        _middle_of_step(*state, a_last, self.dt, self.q, self.v, q_mid, v_mid)
+        self.M = pin.crba(self.model, self._dynamics, q_mid)
+        self.h = pin.nonLinearEffects(self.model, self._dynamics, q_mid, v_mid)
+        self._placed = False
+        for frame in self.frames:
+            frame.known = False
 
-    def torque(self, a: Array, state: State | None = None) -> Array:
-        """Return the torque that, held for dt, gives mean acceleration `a`, shape (n,), N m.
-
-        From `state` on; None for the current one.
-        """
-        q, v = state or (self.q, self.v)
-        q_mid, v_mid = self._middle
-        _middle_of_step(q, v, a, self.dt, q_mid, v_mid)
-        tau: Array = pin.rnea(self.model, self.data, q_mid, v_mid, a)
+    def torque(self, a: Array) -> Array:
+        """Return the torque that, held for dt, gives mean acceleration `a`, shape (n,), N m."""
+        q_mid, v_mid = self._held
+        _middle_of_step(self.q, self.v, a, self.dt, self.q, self.v, q_mid, v_mid)
+        tau: Array = pin.rnea(self.model, self._dynamics, q_mid, v_mid, a)
         return tau
 
 
 @njit(cache=True)
-def _middle_of_step(q: Array, v: Array, a: Array, dt: float, q_mid: Array, v_mid: Array) -> None:
-    """Write position and velocity after dt / 2 at acceleration `a`, shape (n,) each."""
+def _middle_of_step(
+    q: Array, v: Array, a: Array, dt: float, q_now: Array, v_now: Array, q_mid: Array, v_mid: Array
+) -> None:
+    """Copy the state, and write position and velocity after dt / 2 at `a`, shape (n,) each."""
     half = 0.5 * dt
     for j in range(q.size):
         change = half * a[j]
+        q_now[j], v_now[j] = q[j], v[j]
         q_mid[j], v_mid[j] = q[j] + half * (v[j] + 0.5 * change), v[j] + change

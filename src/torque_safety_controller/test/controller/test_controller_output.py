@@ -31,8 +31,6 @@ from viability_bounds_pkg.state import State
 class Fixed:
     """An additional torque that is always the same."""
 
-    rates = False
-
     def __init__(self, torque) -> None:
         self.last = torque
 

@@ -11,6 +11,7 @@ from arms import load_arm
 
 from torque_safety_controller.integral_feedback import MODES, IntegralSettings
 from torque_safety_controller.parts.integral import make_integral
+from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.state import State
 
 ARM = load_arm("panda")
@@ -32,7 +33,6 @@ class IntegralLoop:
 
     def __init__(self, mode, disturbance_max=2.0, **changed) -> None:
         self.robot = ARM.robot(DT)
-        self.robot.rates = True
         self.action = make_integral(mode, make_settings(**changed), disturbance_max * ARM.tau_max)
         self.q, self.v, self.a = ARM.q_start.copy(), REST, REST
         self.torques = [REST]
@@ -119,10 +119,11 @@ def test_it_begins_with_the_torque_it_is_told(mode):
 
 
 @pytest.mark.parametrize("mode", ["none", "joints"])
-def test_what_no_memory_can_hold_fades(mode):
+def test_what_no_memory_can_hold_fades(mode, monkeypatch):
     loop = IntegralLoop(mode)
     loop.robot.update(State(loop.q, REST), REST)
-    loop.robot.C = -LAMBDA * np.diag(np.diagonal(loop.robot.M))  # C + K is singular
+    C = -LAMBDA * np.diag(np.diagonal(loop.robot.M))  # C + K is singular
+    monkeypatch.setattr(RobotModel, "C", C)
     torque = 0.1 * ARM.tau_max
     loop.action.resume(loop.robot, torque)
     np.testing.assert_array_equal(loop.action.last, torque)

@@ -17,7 +17,6 @@ ARM = load_arm("panda")
 
 def at(q):
     robot = ARM.robot(DT)
-    robot.rates = True
     robot.update(State(q, REST), REST)
     return robot
 

@@ -72,7 +72,6 @@ def test_one_integral_for_both_is_what_the_paper_prints(model):
     law = IntegralSettings(np.full(16, np.inf), LAMBDA, SLOW, FAST, MU, "paper")
     action = IntegralAction("task", law, np.full(16, np.inf), hands=2)
     arm = robot(model, STEP)
-    arm.rates = True
 
     def torque(t, a_last, elapsed):
         arm.dt = 0.0  # M and C of the state itself, not of the middle of a step

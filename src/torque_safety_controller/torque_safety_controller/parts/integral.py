@@ -48,10 +48,7 @@ class FadingTorque:
         last: torque of the last step, shape (n,), N m.
         skipped: steps that were not integrated over: time jumped, or the state did.
         saturated: which joints are at their budget, shape (n,).
-        rates: whether the robot's matrices are needed with their rates.
     """
-
-    rates = False
 
     def __init__(self, settings: IntegralSettings) -> None:
         self.settings = settings
@@ -79,7 +76,7 @@ class FadingTorque:
         difference to what the memory asks for fades.
 
         Args:
-            robot: of the arm, updated with rates.
+            robot: of the arm, updated to its state.
             a_last: acceleration commanded in the last step, shape (n,), rad/s^2.
             elapsed: time since the last step, s.
         """
@@ -93,7 +90,7 @@ class FadingTorque:
         The memory holds what it can of it within the budgets; the rest fades.
 
         Args:
-            robot: of the arm, updated with rates.
+            robot: of the arm, updated to its state.
             torque: shape (n,), N m, finite.
         """
         self.last = self._fading = torque
@@ -122,8 +119,6 @@ class IntegralAction(FadingTorque):
     Raises:
         TaskShapeError: the task leaves no null space.
     """
-
-    rates = True
 
     def __init__(
         self, mode: str, settings: IntegralSettings, disturbance_max: Array, hands: int = 1
@@ -258,7 +253,7 @@ class Integral(Part):
 
     Args:
         action: in one of its modes.
-        robot: of the arm; it has to give the rates of its matrices, if the action needs them.
+        robot: of the arm.
 
     Attributes:
         action: as given.
@@ -266,7 +261,6 @@ class Integral(Part):
 
     def __init__(self, action: FadingTorque, robot: RobotModel) -> None:
         self.action, self._robot = action, robot
-        robot.rates = action.rates
 
     def configure(self, settings: Settings) -> None:
         """See `Part.configure`."""

@@ -70,7 +70,7 @@ class PoseTask:
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``J a = kp error - kd J v - J' v + feedforward`` as a term of the cost."""
         frame: FrameModel = robot if self.hand is None else robot.others[self.hand]
-        pose, b = frame.pose, np.empty(6)
+        pose, J, b = frame.pose, frame.J, np.empty(6)
         between = pose.actInv(self.pose_des)
         _spring_and_damper(
             pin.SE3ToXYZQUAT(between) if self.separate else pin.log6(between).vector,
@@ -78,8 +78,8 @@ class PoseTask:
             self.kd,
             _ALL if self.stiffness is None else self.stiffness,
             self.error_max,
-            frame.J,
-            frame.v,
+            J,
+            robot.v,
             frame.drift,
             self.separate,
             b,
@@ -87,8 +87,8 @@ class PoseTask:
         if self.motion is not None and self.separate:
             b += self._separate_feedforward(pose, self.motion)
         elif self.motion is not None:
-            b += self._feedforward(between, frame.J @ frame.v, self.motion)
-        return TaskTerm(frame.J, b, self.weight)
+            b += self._feedforward(between, J @ robot.v, self.motion)
+        return TaskTerm(J, b, self.weight)
 
     def _separate_feedforward(self, pose: pin.SE3, motion: PoseMotion) -> Array:
         """Return ``kd (p_d', w_d) + (p_d'', w_d')`` in the end effector's axes, shape (6,)."""
