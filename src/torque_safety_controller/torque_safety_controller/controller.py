@@ -15,10 +15,8 @@ from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.qp import (
     AccelerationRange,
     InverseDynamicsQP,
-    LinearConstraints,
     NoSolutionFound,
     Solution,
-    stack_constraints,
 )
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.settings import Settings
@@ -206,45 +204,35 @@ class Controller:
         Raises:
             NoSolutionFound: numbers that are not finite or absurd, or no task with a weight.
         """
-        robot, d = self.robot, step.disturbance
-        bounds, low, high = step.limits_of_qp(self._limiter.range())
+        robot, solve = self.robot, self._qp.solve
         terms = [task.term(robot) for task in step.tasks]
-        rows = stack_constraints(
-            [
-                LinearConstraints(G, lower - G @ d, upper - G @ d)
-                for G, lower, upper in step.rows.values()
-            ]
-        )
-
-        def solve(bounds: AccelerationRange, rows: LinearConstraints | None) -> Solution:
-            qp = self._qp
-            return qp.solve(qp.build(terms, bounds, robot.M, low, high, rows, step.forces))
-
+        torques = robot.M, robot.h + step.torque, *self._limiter.range(), step.forces
+        rows = step.commanded_rows() if step.rows else None
         if step.eased is not None:
-            solution = solve(step.eased, rows)
+            solution = solve(terms, *torques, step.eased, rows)
             if solution.exact:
                 return solution
-        solution = solve(bounds, rows)
+        bounds = step.commanded(step.bounds)
+        solution = solve(terms, *torques, bounds, rows)
         if solution.relaxation is None or step.fallback is None:
             return solution
         # Rows with an upper limit lead back from where too little torque is left, which the
         # fallback need not; those of distances have none, and are kept.
-        plan = step.fallback - d
+        plan = step.fallback - step.disturbance
         widened = AccelerationRange(np.minimum(bounds.lower, plan), np.maximum(bounds.upper, plan))
         if rows is not None:
             there = rows.G @ plan
             lower = np.where(np.isfinite(rows.upper), np.minimum(rows.lower, there), rows.lower)
             rows = rows._replace(lower=lower, upper=np.maximum(rows.upper, there))
-        return solve(widened, rows)
+        return solve(terms, *torques, widened, rows)
 
     def _command(self, step: Step) -> None:
         """Find the torque of a step, and remember its accelerations."""
-        robot = self.robot
-        wanted = robot.torque(step.a) + step.torque
-        if step.solution is not None and step.forces is not None:
+        wanted = self.robot.torque(step.a) + step.torque
+        if step.forces is not None and step.solution is not None:
             wanted = wanted - step.forces.B @ step.solution.rho
         step.tau = self._limiter.limited(wanted)
         if step.failure and np.isfinite(wanted).all() and (step.tau != wanted).any():
             # What the motors cannot give is no error for the integral to grow on.
-            step.a = step.a + np.linalg.solve(robot.M, step.tau - wanted)
+            step.a = step.a + np.linalg.solve(self.robot.M, step.tau - wanted)
         self._a_last = step.a

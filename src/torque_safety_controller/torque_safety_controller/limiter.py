@@ -25,7 +25,7 @@ class TorqueLimiter:
 
     def __init__(self, tau_max: ArrayLike, tau_rate_max: ArrayLike | None, dt: float) -> None:
         self.tau_max = np.array(tau_max, dtype=float)
-        self._limits = np.stack([-self.tau_max, self.tau_max])
+        self._limits = -self.tau_max, self.tau_max
         rate = np.asarray(math.inf if tau_rate_max is None else tau_rate_max, dtype=np.float64)
         self._step = np.where(np.isinf(rate), np.inf, rate * dt)
         self._rate_limited = bool(np.isfinite(rate).any())
@@ -40,24 +40,25 @@ class TorqueLimiter:
         self.last = np.clip(tau, *self._limits)
         return self.last
 
-    def range(self) -> np.ndarray:
-        """Return the lower and the upper limits of the next torque, shape (2, n), N m."""
+    def range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lower and the upper limits of the next torque, shape (n,) each, N m."""
         if self.last is None or not self._rate_limited:
             return self._limits
-        reach = np.stack([self.last - self._step, self.last + self._step])
-        return np.clip(reach, *self._limits)
+        lower, upper = self.last - self._step, self.last + self._step
+        return np.clip(lower, *self._limits), np.clip(upper, *self._limits)
 
     def limited(self, tau: np.ndarray) -> np.ndarray:
         """Return `tau` clipped to the limits; the last torque in place of one not finite."""
         limited = np.zeros(self.tau_max.size)
-        if not _clip(tau, self.range(), limited):
-            _clip(limited if self.last is None else self.last, self.range(), limited)
+        lower, upper = self.range()
+        if not _clip(tau, lower, upper, limited):
+            _clip(limited if self.last is None else self.last, lower, upper, limited)
         self.last = limited
         return limited
 
 
 @njit(cache=True)
-def _clip(tau: np.ndarray, limits: np.ndarray, limited: np.ndarray) -> bool:
+def _clip(tau: np.ndarray, lower: np.ndarray, upper: np.ndarray, limited: np.ndarray) -> bool:
     """Write `tau` within its limits; return whether it is finite, else nothing is written."""
     square = 0.0
     for torque in tau:
@@ -65,5 +66,5 @@ def _clip(tau: np.ndarray, limits: np.ndarray, limited: np.ndarray) -> bool:
     if not math.isfinite(square):
         return False
     for j in range(tau.size):
-        limited[j] = min(max(tau[j], limits[0, j]), limits[1, j])
+        limited[j] = min(max(tau[j], lower[j]), upper[j])
     return True

@@ -42,7 +42,7 @@ class Step:
         elapsed: time since the last step, s.
         tau_max: torque limits, shape (n,), N m.
         a_last: acceleration commanded in the last step, shape (n,), rad/s^2.
-        rest: acceleration that brings the arm to rest, shape (n,), rad/s^2.
+        hold_kd: damping of an arm without a goal, 1/s.
         tasks: what the QP serves.
         tracking: whether these are those of the goals.
         stiffness: share of the pose task's stiffness by direction, shape (6,); None for all of it.
@@ -89,16 +89,22 @@ class Step:
         self.elapsed = elapsed
         self.tau_max = tau_max
         self.a_last = a_last
-        self.rest: Array = -hold_kd * robot.v
+        self.hold_kd = hold_kd
         self.tasks: list[Task] = []
         self.rows: dict[Part, LinearConstraints] = {}
         self.bounds = _unbounded(robot.n)
-        nothing = np.zeros(robot.n)
+        self._nothing = nothing = np.zeros(robot.n)
         self.torque: Array = nothing
         self.integral_change: Array = nothing
         self.disturbance: Array = nothing
         self.a: Array = nothing
         self.tau: Array = nothing
+
+    @property
+    def rest(self) -> Array:
+        """Acceleration that brings the arm to rest, shape (n,), rad/s^2."""
+        rest: Array = -self.hold_kd * self.robot.v
+        return rest
 
     @property
     def learns(self) -> bool:
@@ -117,21 +123,22 @@ class Step:
         For one upwards the upper bound is lowered, and else the lower one raised; if they cross,
         the other one follows.
         """
+        if self.disturbance is self._nothing:
+            return bounds
         lower, upper = np.empty(len(bounds.lower)), np.empty(len(bounds.lower))
         _narrow(self.disturbance, bounds.lower, bounds.upper, lower, upper)
         return AccelerationRange(lower, upper)
 
-    def limits_of_qp(self, torque_limits: Array) -> tuple[AccelerationRange, Array, Array]:
-        """Return bounds of the commanded accelerations a, and lower and upper limits of M a.
-
-        Args:
-            torque_limits: lower and upper ones, shape (2, n), N m.
-        """
-        n, h, d = self.robot.n, self.robot.h, self.disturbance
-        low, high, tau_low, tau_high = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-        lower, upper = self.bounds
-        _write_limits(d, lower, upper, low, high, h, self.torque, torque_limits, tau_low, tau_high)
-        return AccelerationRange(low, high), tau_low, tau_high
+    def commanded_rows(self) -> LinearConstraints | None:
+        """Return the rows as constraints of the commanded accelerations; None for none."""
+        rows = [row for row in self.rows.values() if len(row.G)]
+        if not rows:
+            return None
+        G, lower, upper = rows[0]
+        if len(rows) > 1:
+            G, lower, upper = map(np.concatenate, zip(*rows, strict=True))
+        extra = G @ self.disturbance
+        return LinearConstraints(G, lower - extra, upper - extra)
 
     def relaxation_of(self, part: Part) -> Array | None:
         """Return by how much the QP relaxed the rows of a part, in their units; None for not."""
@@ -204,26 +211,6 @@ def _narrow(disturbance: Array, lower: Array, upper: Array, low: Array, high: Ar
         else:
             low[j] = lower[j] - e
             high[j] = max(low[j], upper[j])
-
-
-@njit(cache=True)
-def _write_limits(
-    disturbance: Array,
-    lower: Array,
-    upper: Array,
-    low: Array,
-    high: Array,
-    h: Array,
-    torque: Array,
-    limits: Array,
-    tau_low: Array,
-    tau_high: Array,
-) -> None:
-    """Write bounds of a, `low` and `high`, and limits of M a, see `Step.limits_of_qp`."""
-    _narrow(disturbance, lower, upper, low, high)
-    for j in range(h.size):
-        bias = h[j] + torque[j]
-        tau_low[j], tau_high[j] = limits[0, j] - bias, limits[1, j] - bias
 
 
 def joints_beyond(model: pin.Model, torque: Array, most: Array) -> str:

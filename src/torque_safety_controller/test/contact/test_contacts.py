@@ -81,11 +81,9 @@ class ContactArm:
         M = pin.crba(self.model, self.data, self.q)
         h = pin.nonLinearEffects(self.model, self.data, self.q, self.v)
         rest, forces = TaskTerm(None, -20.0 * self.v, weight), self.forces(F_des)
-        qp, wide = InverseDynamicsQP(7, 1e-9), np.full(7, 100.0)
+        qp, wide, most = InverseDynamicsQP(7, 1e-9), np.full(7, 100.0), np.full(7, tau_max)
         bounds = AccelerationRange(-wide, wide)
-        solution = qp.solve(
-            qp.build([rest], bounds, M, -tau_max - h, tau_max - h, contacts=forces)
-        )
+        solution = qp.solve([rest], M, h, -most, most, forces, bounds, None)
         np.testing.assert_allclose(solution.a, rest.b, atol=1e-2)
         assert (solution.rho >= 0.0).all()
         tau = M @ solution.a + h - forces.B @ solution.rho

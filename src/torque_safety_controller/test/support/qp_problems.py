@@ -67,13 +67,10 @@ class Problem(NamedTuple):
         return np.maximum(np.maximum(lower - S @ a, S @ a - upper), 0.0)
 
 
-def built(qp, problem: Problem):
-    tasks, a_lower, a_upper, *limits = problem
-    return qp.build(tasks, AccelerationRange(a_lower, a_upper), *limits)
-
-
 def solution_of(qp, problem: Problem):
-    return qp.solve(built(qp, problem))
+    tasks, a_lower, a_upper, M, tau_lower, tau_upper, rows, contacts = problem
+    bounds = AccelerationRange(a_lower, a_upper)
+    return qp.solve(tasks, M, np.zeros(N), tau_lower, tau_upper, contacts, bounds, rows)
 
 
 def random_problem(rng, k=0, r=0, room=1.0, scale=1.0, masses=1.0) -> Problem:

@@ -10,7 +10,6 @@ from torque_safety_controller.qp.program import (
     QuadraticProgram,
     TaskTerm,
     WrenchTerm,
-    stack_constraints,
 )
 from torque_safety_controller.qp.solvers import (
     SOLVERS,
@@ -37,5 +36,4 @@ __all__ = [
     "Status",
     "TaskTerm",
     "WrenchTerm",
-    "stack_constraints",
 ]

@@ -8,13 +8,14 @@ possible, in the sense of least squares.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from torque_safety_controller.qp.active_set import write_and_solve
 from torque_safety_controller.qp.program import (
     AccelerationRange,
     ContactForces,
@@ -84,35 +85,77 @@ class InverseDynamicsQP:
             *map(DaqpSolver, _PROXIMAL),
             ProxqpSolver(),
         )
+        self._nothing = np.zeros((0, n), order="F"), np.zeros(0), 0.0
+        self._no_joints = TaskTerm(None, np.zeros(n), 0.0)
+        self._arrays: dict[tuple[int, int], tuple[QuadraticProgram, NDArray[np.int32]]] = {}
 
-    def build(
+    def solve(
         self,
         tasks: Sequence[TaskTerm],
-        bounds: AccelerationRange,
         M: Array,
-        tau_lower: Array,
-        tau_upper: Array,
-        constraints: LinearConstraints | None = None,
-        contacts: ContactForces | None = None,
-    ) -> QuadraticProgram:
-        """Return the program in x = (a, rho) with C = (M, -B; G, 0).
+        h: Array,
+        tau_min: Array,
+        tau_max: Array,
+        contacts: ContactForces | None,
+        bounds: AccelerationRange,
+        constraints: LinearConstraints | None,
+    ) -> Solution:
+        """Return the accelerations and forces that serve the tasks best within the limits.
+
+        The program is in x = (a, rho), with C = (M, -B; G, 0). Solvers are asked where the limits
+        active last are not those active now, as a linear system tells in much less time.
 
         Args:
             tasks: at least one.
-            bounds: of the accelerations.
             M: mass matrix, shape (n, n).
-            tau_lower: lower limits of M a - B rho, bias torque subtracted, shape (n,), N m.
-            tau_upper: upper limits of M a - B rho, shape (n,), N m.
-            constraints: on the accelerations besides.
-            contacts: what the environment can exert.
+            h: torque of the motors besides M a - B rho, shape (n,), N m.
+            tau_min: lower limits of the motors' torques, shape (n,), N m.
+            tau_max: upper limits, shape (n,), N m.
+            contacts: what the environment can exert; None for nothing.
+            bounds: of the accelerations.
+            constraints: on the accelerations besides; None for none.
 
         Raises:
-            NoSolutionFound: no task with a weight.
+            NoSolutionFound: numbers that are not finite or absurd, limits that are crossed, or no
+                task with a weight.
             ValueError: constraints or contacts of the wrong shape.
         """
         n = self._n
-        weights = [task.weight for task in tasks]
-        k = r = 0
+        program, active = self._program(constraints, contacts)
+        A, b, weight, b_joints, weight_joints = self._cost(tasks, contacts)
+        x = np.empty(len(program.g))
+        if write_and_solve(
+            *program, active, x, self._gamma, *bounds, M, h, tau_min, tau_max,
+            A, b, weight, b_joints, weight_joints,
+        ):  # fmt: skip
+            a, rho = (x, _NO_FORCES) if contacts is None else (x[:n], x[n:])
+            return Solution(a, rho, None, None, 1)
+        for solver in self._solvers:
+            result = solver.solve(program)
+            if result.status is not Status.FAILED:
+                break
+        x, iterations = result.x, result.iterations
+        relaxation = constraint_relaxation = None
+        if result.status is Status.SOLVED:
+            active[:] = 0 if result.active is None else result.active
+        elif result.status is Status.INFEASIBLE:
+            x, iterations = self._relaxed(program)
+            violations = program.violations(x)
+            bounds, rows = violations[:n], violations[len(x) + n :]
+            if max(bounds.max(), rows.max(initial=0.0)) >= _NEGLIGIBLE:
+                relaxation, constraint_relaxation = bounds, rows
+        else:
+            raise NoSolutionFound("not finite, absurd, or lower limits above upper ones", program)
+        return Solution(x[:n], x[n:], relaxation, constraint_relaxation, iterations)
+
+    def _program(
+        self, constraints: LinearConstraints | None, contacts: ContactForces | None
+    ) -> tuple[QuadraticProgram, NDArray[np.int32]]:
+        """Return a program with constraints and contacts, and what was active in the last.
+
+        All of a size are in the same arrays.
+        """
+        n, k, r = self._n, 0, 0
         if constraints is not None:
             G, row_lower, row_upper = constraints
             k = len(G)
@@ -122,66 +165,61 @@ class InverseDynamicsQP:
                     f"upper {row_upper.shape}"
                 )
         if contacts is not None:
-            B, rho_max, wrench_tasks = contacts
-            r = len(rho_max)
-            if B.shape != (n, r):
-                raise ValueError(f"forces on {n} joints with B {B.shape}, rho_max {rho_max.shape}")
-            weights += [task.weight for task in wrench_tasks]
-        greatest = max([0.0, *weights])
+            r = len(contacts.rho_max)
+            if contacts.B.shape != (n, r):
+                shapes = f"B {contacts.B.shape}, rho_max {contacts.rho_max.shape}"
+                raise ValueError(f"forces on {n} joints with {shapes}")
+        if (k, r) not in self._arrays:
+            size = n + r
+            shapes = (size, size), size, (n + k, size), size + n + k, size + n + k
+            program = QuadraticProgram(*map(np.zeros, shapes))
+            self._arrays[k, r] = program, np.zeros(size + n + k, dtype=np.int32)
+        program, active = self._arrays[k, r]
+        if constraints is not None:
+            program.C[n:, :n] = G
+            program.lower[r + 2 * n :], program.upper[r + 2 * n :] = row_lower, row_upper
+        if contacts is not None:
+            program.C[:n, n:], program.upper[n : n + r] = -contacts.B, contacts.rho_max
+        return program, active
+
+    def _cost(
+        self, tasks: Sequence[TaskTerm], contacts: ContactForces | None
+    ) -> tuple[Array, Array, float, Array, float]:
+        """Return A, b, weight, and b and weight of the joints, as `write_and_solve` takes them."""
+        weights = [0.0, *[task.weight for task in tasks]]
+        if contacts is not None:
+            weights += [task.weight for task in contacts.tasks]
+        greatest = max(weights)
         if greatest == 0.0:
             raise NoSolutionFound("no task with a weight above 0")
-        size = n + r
-        H, g, C = np.zeros((size, size)), np.zeros(size), np.zeros((n + k, size))
-        lower, upper = np.zeros(size + n + k), np.zeros(size + n + k)
-        # Mostly one task is of the joints: it is written at once.
-        joints = [task for task in tasks if task.A is None]
-        b, share = (joints[0].b, joints[0].weight / greatest) if joints else (tau_lower, 0.0)
-        _write(H, g, C, lower, upper, self._gamma, *bounds, M, tau_lower, tau_upper, b, share)
-        for task in joints[1:]:
-            H[range(n), range(n)] += task.weight / greatest
-            g[:n] -= task.weight / greatest * task.b
-        for A, b, weight in tasks:
-            if A is not None:
-                _add_least_squares(H, g, A, b, weight / greatest, 0)
-        if constraints is not None:
-            C[n:, :n] = G
-            lower[size + n :] = row_lower
-            upper[size + n :] = row_upper
-        if contacts is not None:
-            C[:n, n:] = -B
-            upper[n:size] = rho_max
-            for W, F_des, weight in wrench_tasks:
-                if W.shape != (*F_des.shape, r):
-                    shapes = f"W {W.shape}, F_des {F_des.shape}"
-                    raise ValueError(f"wrench task of {r} forces, {shapes}")
-                _add_least_squares(H, g, W, F_des, weight / greatest, n)
-        return QuadraticProgram(H, g, C, lower, upper)
+        # Mostly the last task is of the joints, and there is at most one before it.
+        others, last = tasks, self._no_joints
+        if tasks and tasks[-1].A is None:
+            others, last = tasks[:-1], tasks[-1]
+        if contacts is not None or len(others) > 1 or (others and others[0].A is None):
+            A, b, weight = self._stacked(others, contacts)
+        else:
+            A, b, weight = others[0] if others else self._nothing
+        return A, b, weight / greatest, last.b, last.weight / greatest
 
-    def solve(self, program: QuadraticProgram) -> Solution:
-        """Return the accelerations and forces that serve the tasks best within the limits.
-
-        Args:
-            program: as `build` returned it.
-
-        Raises:
-            NoSolutionFound: numbers that are not finite or absurd, or limits that are crossed.
-        """
-        n = self._n
-        for solver in self._solvers:
-            status, x, iterations = solver.solve(program)
-            if status is not Status.FAILED:
-                break
-        relaxation = constraint_relaxation = None
-        if status is Status.INFEASIBLE:
-            x, iterations = self._relaxed(program)
-            violations = program.violations(x)
-            bounds, rows = violations[:n], violations[len(x) + n :]
-            if max(bounds.max(), rows.max(initial=0.0)) >= _NEGLIGIBLE:
-                relaxation, constraint_relaxation = bounds, rows
-        elif status is not Status.SOLVED:
-            raise NoSolutionFound("not finite, absurd, or lower limits above upper ones", program)
-        a, rho = (x, _NO_FORCES) if len(x) == n else (x[:n], x[n:])
-        return Solution(a, rho, relaxation, constraint_relaxation, iterations)
+    def _stacked(
+        self, tasks: Sequence[TaskTerm], contacts: ContactForces | None
+    ) -> tuple[Array, Array, float]:
+        """Return terms of accelerations and forces as one of weight 1: A, b and weight."""
+        n, r = self._n, 0 if contacts is None else len(contacts.rho_max)
+        terms = [(np.eye(n) if A is None else A, b, weight, 0) for A, b, weight in tasks]
+        for W, F_des, weight in () if contacts is None else contacts.tasks:
+            if W.shape != (*F_des.shape, r):
+                shapes = f"W {W.shape}, F_des {F_des.shape}"
+                raise ValueError(f"wrench task of {r} forces, {shapes}")
+            terms.append((W, F_des, weight, n))
+        A, b = np.zeros((sum(len(each[1]) for each in terms), n + r), order="F"), [np.zeros(0)]
+        for part, wanted, weight, first in terms:
+            root = math.sqrt(max(weight, 0.0))
+            row = sum(map(len, b))
+            A[row : row + len(wanted), first : first + part.shape[1]] = root * part
+            b.append(root * wanted)
+        return A, np.concatenate(b), 1.0
 
     def _relaxed(self, program: QuadraticProgram) -> tuple[Array, int]:
         """Return the solution with bounds and constraints relaxed least, and the iterations."""
@@ -190,74 +228,3 @@ class InverseDynamicsQP:
         # Where too little room is left for the tasks, what relaxes least keeps the limits, too.
         x = result.x if result.status is Status.SOLVED else least_x
         return x, iterations + result.iterations
-
-
-# Compiled, because they are called at every step and NumPy takes several times as long.
-
-
-@njit(cache=True)
-def _write(
-    H: Array,
-    g: Array,
-    C: Array,
-    lower: Array,
-    upper: Array,
-    gamma: float,
-    a_lower: Array,
-    a_upper: Array,
-    M: Array,
-    tau_lower: Array,
-    tau_upper: Array,
-    b: Array,
-    weight: float,
-) -> None:
-    """Write limits of a and M a, and the cost ``gamma |x|^2 / 2 + weight |a - b|^2 / 2``.
-
-    Args:
-        H: of zeros, as the next ones: of a `QuadraticProgram` in x = (a, rho).
-        g: shape (n + r,).
-        C: shape (n + k, n + r).
-        lower: shape (n + r + n + k,).
-        upper: same shape.
-        gamma: weight of |x|^2.
-        a_lower: limits of a, shape (n,).
-        a_upper: shape (n,).
-        M: shape (n, n).
-        tau_lower: limits of M a, shape (n,).
-        tau_upper: shape (n,).
-        b: shape (n,).
-        weight: of the difference of a and b.
-    """
-    n, size = len(a_lower), len(g)
-    for i in range(size):
-        H[i, i] = gamma
-    for i in range(n):
-        if weight > 0.0:
-            H[i, i] += weight
-            g[i] = -weight * b[i]
-        for j in range(n):
-            C[i, j] = M[i, j]
-        lower[i], upper[i] = a_lower[i], a_upper[i]
-        lower[size + i], upper[size + i] = tau_lower[i], tau_upper[i]
-
-
-@njit(cache=True)
-def _add_least_squares(H: Array, g: Array, A: Array, b: Array, weight: float, first: int) -> None:
-    """Add ``weight * |A z - b|^2 / 2`` to the cost ``x'Hx / 2 + g'x``, in place.
-
-    z are as many of x as A has columns, from index `first` on.
-    """
-    m, n = A.shape
-    for i in range(n):
-        for j in range(i + 1):
-            s = 0.0
-            for k in range(m):
-                s += A[k, i] * A[k, j]
-            s *= weight
-            H[first + i, first + j] += s
-            if i != j:
-                H[first + j, first + i] += s
-        s = 0.0
-        for k in range(m):
-            s += A[k, i] * b[k]
-        g[first + i] -= weight * s

@@ -101,7 +101,7 @@ class ContactForces(NamedTuple):
 class QuadraticProgram(NamedTuple):
     """``min x'Hx/2 + g'x  subject to  lower <= (x, C x) <= upper``; equal limits are equalities.
 
-    The arrays are not to be changed: solvers keep references to them.
+    Solvers do not change its arrays.
     """
 
     H: Array
@@ -136,11 +136,3 @@ class NoSolutionFound(ArmSafetyError, RuntimeError):
     def __init__(self, message: str, program: QuadraticProgram | None = None) -> None:
         super().__init__(message)
         self.program = program
-
-
-def stack_constraints(parts: Sequence[LinearConstraints]) -> LinearConstraints | None:
-    """Return all constraints as one, in order; None without any."""
-    given = [part for part in parts if len(part.G)]
-    if len(given) < 2:
-        return given[0] if given else None
-    return LinearConstraints(*(np.concatenate(each) for each in zip(*given, strict=True)))

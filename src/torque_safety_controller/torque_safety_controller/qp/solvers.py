@@ -1,35 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """Solvers of quadratic programs: DAQP by default, ProxQP by name or where DAQP fails.
 
-DAQP [Arnstrom2022] is a dual active-set method, certain about infeasibility. It is asked where the
-limits active last are not those active now, as a linear system tells in much less time. It does
-not look at its input: NaN in C passes as a limit that is never violated.
+DAQP [Arnstrom2022] is a dual active-set method, certain about infeasibility. It does not look at
+its input: NaN in C passes as a limit that is never violated.
 ProxQP is an augmented Lagrangian method; version 0.8 goes on for seconds where there is no
 solution, and now and then calls solved what has a duality gap. So answers of both are checked.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from enum import Enum
 from typing import NamedTuple, Protocol
 
 import daqp
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from proxsuite import proxqp
 
+from torque_safety_controller.qp.active_set import TOLERANCE, clip_and_check
 from torque_safety_controller.qp.program import QuadraticProgram
 
 Array = NDArray[np.float64]
 
-_TOLERANCE = 1e-9
-"""Violation of a limit, in its unit, that counts as none."""
-
 _SETTINGS: dict[str, float] = {
-    "primal_tol": _TOLERANCE,
+    "primal_tol": TOLERANCE,
     "iter_limit": 1000,
     "eta_prox": 1e-10,
     "sing_tol": 1e-13,
@@ -68,6 +63,8 @@ class SolverResult(NamedTuple):
     x: Array
     """Shape (p,), within its own limits exactly; means nothing unless solved."""
     iterations: int
+    active: NDArray[np.int32] | None = None
+    """What is active, 1 for upper limits, 3 for lower ones, else 0, shape (p + m,), if known."""
 
 
 class Solver(Protocol):
@@ -78,7 +75,7 @@ class Solver(Protocol):
 
 
 class DaqpSolver:
-    """Solves programs by the limits active in the last of the same size, or with DAQP from them.
+    """Solves programs with DAQP, from the limits that were active in the last of the same size.
 
     Args:
         proximal: for costs that are flat in some directions, with a diagonal H: weight of the
@@ -93,12 +90,7 @@ class DaqpSolver:
     def solve(self, program: QuadraticProgram) -> SolverResult:
         """Return the minimum, or why there is none; see `Solver`."""
         H, g, C, lower, upper = program
-        active = self._active.get(C.shape)
-        if active is None:
-            active = self._active[C.shape] = np.zeros(len(lower), dtype=np.int32)
-        x = np.empty(len(g))
-        if solved_by(active, H, g, C, lower, upper, x):
-            return SolverResult(Status.SOLVED, x, 1)
+        active = self._active.setdefault(C.shape, np.zeros(len(lower), dtype=np.int32))
         result = _solve(program, active, self._settings)
         if result.status is Status.SOLVED:
             return result
@@ -166,7 +158,7 @@ def _solve(
         status = Status.SOLVED
     else:
         status = Status.FAILED
-    return SolverResult(status, x, info["iterations"])
+    return SolverResult(status, x, info["iterations"], active)
 
 
 def _is_valid(program: QuadraticProgram) -> bool:
@@ -178,126 +170,3 @@ def _is_valid(program: QuadraticProgram) -> bool:
         and (lower < np.inf).all()
         and (upper > -np.inf).all()
     )
-
-
-# Compiled, because they are called at every step and NumPy takes twenty times as long.
-
-
-@njit(cache=True)
-def solved_by(
-    active: NDArray[np.int32], H: Array, g: Array, C: Array, lower: Array, upper: Array, x: Array
-) -> bool:
-    """Return whether the solution has these limits active; if so, write it to x.
-
-    With the active limits as equalities A x = b it is
-
-        (H, A'; A, 0) (x, lambda) = (-g, b).
-
-    It is right if x is within all limits, and no multiplier pulls towards its own.
-
-    Args:
-        active: 1 for upper limits, 3 for lower ones, else 0, shape (p + m,).
-        H: this and the next ones as of a `QuadraticProgram`.
-        g: shape (p,).
-        C: shape (m, p).
-        lower: shape (p + m,).
-        upper: same shape.
-        x: shape (p,), written.
-    """
-    m, p = C.shape
-    size = p + np.count_nonzero(active)
-    if size > 2 * p:
-        return False
-    system = np.zeros((size, size + 1))
-    system[:p, :p] = H
-    system[:p, size] = -g
-    row = p
-    for i in range(p + m):
-        if not lower[i] <= upper[i]:
-            return False
-        if active[i] != 0:
-            if i < p:
-                system[row, i] = system[i, row] = 1.0
-            else:
-                for j in range(p):
-                    system[row, j] = system[j, row] = C[i - p, j]
-            system[row, size] = upper[i] if active[i] == 1 else lower[i]
-            row += 1
-    if not _eliminated(system):
-        return False
-    multipliers, row = np.zeros(p + m), p
-    for i in range(p + m):
-        if active[i] != 0:
-            multipliers[i] = system[row, size]
-            row += 1
-            if lower[i] < upper[i] and multipliers[i] * (2 - active[i]) < 0.0:
-                return False
-    for i in range(p):
-        x[i] = system[i, size]
-        if not lower[i] - _TOLERANCE <= x[i] <= upper[i] + _TOLERANCE:
-            return False
-    return clip_and_check(x, C, lower, upper, _TOLERANCE, multipliers, active)
-
-
-@njit(cache=True)
-def _eliminated(system: Array) -> bool:
-    """Solve A z = b, given as (A, b), by Gauss; z takes the place of b. False if A is singular."""
-    n = len(system)
-    for i in range(n):
-        pivot = i
-        for row in range(i + 1, n):
-            if abs(system[row, i]) > abs(system[pivot, i]):
-                pivot = row
-        if system[pivot, i] == 0.0:
-            return False
-        for j in range(i, n + 1):
-            system[i, j], system[pivot, j] = system[pivot, j], system[i, j]
-        for row in range(i + 1, n):
-            factor = system[row, i] / system[i, i]
-            if factor != 0.0:
-                for j in range(i + 1, n + 1):
-                    system[row, j] -= factor * system[i, j]
-    for i in range(n - 1, -1, -1):
-        for j in range(i + 1, n):
-            system[i, n] -= system[i, j] * system[j, n]
-        system[i, n] /= system[i, i]
-    return True
-
-
-@njit(cache=True)
-def clip_and_check(
-    x: Array,
-    C: Array,
-    lower: Array,
-    upper: Array,
-    violation: float,
-    multipliers: Array,
-    sense: NDArray[np.int32],
-) -> bool:
-    """Clip x to its own limits, in place; return whether it and C x are finite and in limits.
-
-    Args:
-        x: shape (p,).
-        C: shape (m, p).
-        lower: of x, then of C x, shape (p + m,).
-        upper: same shape.
-        violation: that is allowed of the limits of C x.
-        multipliers: shape (p + m,), > 0 where the upper limit is active, < 0 for the lower.
-        sense: shape (p + m,), written: what is active, as DAQP takes it.
-    """
-    m, p = C.shape
-    for i in range(p):
-        if not (math.isfinite(x[i]) and lower[i] <= upper[i]):
-            return False
-        x[i] = min(max(x[i], lower[i]), upper[i])
-    for i in range(m):
-        value = 0.0
-        for j in range(p):
-            value += C[i, j] * x[j]
-        low, high = lower[p + i] - violation, upper[p + i] + violation
-        # So put that it is false where something is NaN.
-        if not (math.isfinite(value) and low <= value <= high):
-            return False
-    for i in range(m + p):
-        sense[i] = 1 if multipliers[i] > 0.0 else 3 if multipliers[i] < 0.0 else 0
-    return True

@@ -58,20 +58,35 @@ class PostureTask:
         return TaskTerm(None, b, self.weight)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _spring_and_damper(
     q_des: Array, q: Array, v: Array, kp: float, kd: float, J: Array | None, b: Array
 ) -> None:
     """Write ``P kp (q_des - q) - kd v`` to b, shape (n,).
 
     P leaves what moves no hand, ``I - J' (J J' + r I)^-1 J`` with J of shape (m, n); r counts
-    where J has lost rank, and there leaves in what the pose cannot feel. P is I without J, and
-    where numbers are not finite. Compiled, because NumPy takes four times as long.
+    where J has lost rank, and there leaves in what the pose cannot feel. P is I without J.
+    Compiled, and solved by Gauss without pivots, because NumPy takes four times as long.
     """
-    pull = kp * (q_des - q)
-    b[:] = pull - kd * v
+    for j in range(q.size):
+        b[j] = kp * (q_des[j] - q[j])
     if J is not None:
-        inner = J @ J.T + _RANK_REGULARISATION * np.eye(len(J))
-        moved = J @ pull
-        if np.isfinite(inner).all() and np.isfinite(moved).all():
-            b -= J.T @ np.linalg.solve(inner, moved)
+        m = len(J)
+        inner = np.zeros((m, m + 1))  # the last column becomes the solution
+        for i in range(m):
+            inner[i, i] = _RANK_REGULARISATION
+            for j in range(q.size):
+                inner[i, m] += J[i, j] * b[j]
+                for k in range(m):
+                    inner[i, k] += J[i, j] * J[k, j]
+        for i in range(m):
+            for row in range(m):
+                if row != i:
+                    factor = inner[row, i] / inner[i, i]
+                    for k in range(i, m + 1):
+                        inner[row, k] -= factor * inner[i, k]
+        for i in range(m):
+            for j in range(q.size):
+                b[j] -= J[i, j] * inner[i, m] / inner[i, i]
+    for j in range(q.size):
+        b[j] -= kd * v[j]
