@@ -24,6 +24,7 @@ from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.parameter_files import YamlError, read_yaml
 from viability_bounds_pkg.ros.arm_node import connect
+from viability_bounds_pkg.ros.given_parameters import remember_arguments
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = {
@@ -100,6 +101,7 @@ def run_chain(
     scenario: dict[str, Any],
     per_node: dict[str, dict[str, Any]],
     not_recorded: tuple[str, ...] = (),
+    declared: bool = False,
 ) -> ChainResult:
     """Play a scenario through bounds, controller and robot node, in lockstep.
 
@@ -109,6 +111,7 @@ def run_chain(
         per_node: parameters that differ for one node, by node name; with ``estimator_node`` among
             them this node runs too.
         not_recorded: topics whose values are not needed: NaN; each costs 4% of a period to record.
+        declared: whether other nodes know the parameters of the bounds node, as from a file.
     """
     lockstep = {
         "clock": "lockstep",
@@ -119,6 +122,11 @@ def run_chain(
     with tempfile.TemporaryDirectory() as directory, _context():
         path = Path(directory) / "scenario.yaml"
         path.write_text(yaml.safe_dump(scenario))
+        if declared:
+            own = values | per_node["bounds_node"]
+            known = Path(directory) / "bounds.yaml"
+            known.write_text(yaml.safe_dump({"/**/bounds_node": {"ros__parameters": own}}))
+            remember_arguments(rclpy.get_default_context(), ("--params-file", str(known)))
         nodes: dict[str, Any] = {}
         try:
             for name, kind in NODES.items():

@@ -39,7 +39,7 @@ NODES = {
 """With parameters by which a node has all its topics."""
 
 OF_ROS = {"/rosout", "/parameter_events"}
-SOMETIMES = {"/robot_description", "/estimated_joint_states"}
+SOMETIMES = {"/robot_description", "/estimated_joint_states", "/commanded_accelerations"}
 """Topics that parameters switch on."""
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.node.declared import limits_jerk
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.collision.avoidance import Collision
 from torque_safety_controller.parts.collision.model import build_collision_model
@@ -70,6 +71,8 @@ def make_controller(
     Raises:
         SettingError: parameters that do not fit the URDF.
     """
+    if limits_jerk(declared):
+        _check_jerk(config)
     urdf = robot_urdf(config, node)
     model = load_model(config, urdf)
     if node is not None:
@@ -92,6 +95,17 @@ def make_controller(
     frames = config.end_effectors, config.base_frame
     locked = LockedJoints(config, urdf, model, robot.payload, *frames)
     return controller, base.placement, locked
+
+
+def _check_jerk(config: ControllerConfiguration) -> None:
+    """Raise `SettingError` for parts that know nothing of a limited jerk."""
+    for name, value, off in (
+        ("disturbance_time", config.gains.disturbance_time, "0"),
+        ("safety_filter", config.safety_filter, "false"),
+        ("collision_avoidance", config.collision.collision_avoidance, "false"),
+    ):
+        if value:
+            raise SettingError(name, value, f"{off} where bounds_node has jerk_max")
 
 
 def make_parts(
@@ -135,7 +149,7 @@ def make_parts(
         JointBounds(_own_bounds(config, declared)),
         _safety_filter(config, robot.model),
         # A slowed arm is slowed inside of what the filter allows.
-        SlowDown(config.position_min, config.position_max, config.dt),
+        SlowDown(config.position_min, config.position_max, config.dt, limits_jerk(declared)),
         # These bounds are for rows of missed deadlines, too.
         _held_torque(robot, declared),
         # It counts on no more braking than the bounds leave.

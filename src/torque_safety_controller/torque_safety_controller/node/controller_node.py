@@ -23,6 +23,7 @@ from torque_safety_controller.node.declared import (
     commands_in_flight,
     covered_misses,
     declared_robot,
+    limits_jerk,
 )
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.periodic import UNSEEN, JointCommands, LimitsReader, StateStream
@@ -122,7 +123,9 @@ class ControllerNode(ArmNode):
             self._goals,
         )
         with self.starting():
-            self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
+            self._commands = JointCommands(
+                self, config.joints, config.ros2_control_topic, limits_jerk(declared)
+            )
         self._published = StatePublisher(self, self._controller.robot, config, base, self._states)
         ENABLE_TORQUE.serve(self, self._on_enable_torque)
         self.listen_to_states(config.use_estimated_states, self._on_state, config.joints)
@@ -256,6 +259,7 @@ class ControllerNode(ArmNode):
             supervisor.answered()
             return
         step = self._controller.step(state, limits, order, elapsed)
+        self._commands.accelerations(step.a, stamp)
         self._commands.torque(self._for_robot(step.tau, state), stamp)
         states.mark_answered()
         supervisor.answered(step.tau, step.failure, step.planned)
@@ -273,6 +277,7 @@ class ControllerNode(ArmNode):
     def _hold(self, stamp: Any) -> None:
         """Have the drives hold the arm, in the turns in which they report continuous joints."""
         states = self._states
+        self._commands.accelerations(np.zeros(len(states.q)), stamp)
         self._commands.position(self._handover.hold(states.q) - states.turns, stamp)
 
     def _take_over(self, state: State, limits: AccelerationRange) -> None:

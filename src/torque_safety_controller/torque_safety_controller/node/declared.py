@@ -23,6 +23,11 @@ def declared_robot(node: Node) -> BoundsConfiguration | None:
         return None
 
 
+def limits_jerk(robot: BoundsConfiguration | None) -> bool:
+    """Return whether the bounds are for a limited jerk, and need the accelerations commanded."""
+    return robot is not None and len(robot.jerk_max) > 0
+
+
 def commands_in_flight(robot: BoundsConfiguration | None) -> int:
     """Return how many of the last commands may act at a state, by what is declared.
 

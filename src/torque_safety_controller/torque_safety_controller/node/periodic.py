@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rclpy.exceptions import InvalidTopicNameException
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
-from trajectory_msgs.msg import JointTrajectory
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from torque_safety_controller.node.topics import ROS2_CONTROL_EFFORTS
 from torque_safety_controller.qp import AccelerationRange
@@ -25,7 +25,7 @@ from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Arrival, JointOrder, JointStateReader
 from viability_bounds_pkg.ros.refusals import count_refusal
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
-from viability_bounds_pkg.ros.topics import JOINT_COMMANDS
+from viability_bounds_pkg.ros.topics import COMMANDED_ACCELERATIONS, JOINT_COMMANDS
 
 UNSEEN = 3
 """Refused states in a row after which nothing is known of the arm."""
@@ -187,18 +187,28 @@ class JointCommands:
         node: the publishing node.
         joints: names of the n joints.
         ros2_control_topic: of the torques in `joints` order; empty for none.
+        accelerations: whether ``commanded_accelerations`` go with them.
 
     Raises:
         SettingError: it is no name of a topic.
     """
 
-    def __init__(self, node: ArmNode, joints: Sequence[str], ros2_control_topic: str) -> None:
+    def __init__(
+        self,
+        node: ArmNode,
+        joints: Sequence[str],
+        ros2_control_topic: str,
+        accelerations: bool = False,
+    ) -> None:
         self._torques = JointState(name=list(joints))
         self._positions = JointState(
             name=list(joints), velocity=array("d", np.zeros(len(joints)).tobytes())
         )
         self._last = self._torques
         self._commands = node.stream(JOINT_COMMANDS)
+        self._accelerations = None
+        if accelerations:
+            self._accelerations = node.stream(COMMANDED_ACCELERATIONS)
         self._efforts = None
         if ros2_control_topic:
             try:
@@ -212,6 +222,15 @@ class JointCommands:
     def stamp(self) -> int:
         """Stamp of the state answered last, ns."""
         return stamp_to_ns(self._last.header.stamp)
+
+    def accelerations(self, a: np.ndarray, stamp: Any) -> None:
+        """Tell, where it is asked for, what the next command stands for, shape (n,), rad/s^2."""
+        if self._accelerations is None:
+            return
+        point = JointTrajectoryPoint(accelerations=array("d", a.tobytes()))
+        message = JointTrajectory(joint_names=self._torques.name, points=[point])
+        message.header.stamp = stamp
+        self._accelerations.publish(message)
 
     def torque(self, tau: np.ndarray, stamp: Any) -> None:
         """Send torques, shape (n,), N m, for the state with `stamp`."""

@@ -32,9 +32,17 @@ class SlowDown(Part):
         position_min: lower position limits without margins, shape (n,), rad.
         position_max: upper ones, shape (n,), rad.
         period: of control, s.
+        without_jolts: whether the bounds demand none, as their jerk is limited.
     """
 
-    def __init__(self, position_min: Array, position_max: Array, period: float) -> None:
+    def __init__(
+        self,
+        position_min: Array,
+        position_max: Array,
+        period: float,
+        without_jolts: bool = False,
+    ) -> None:
+        self._without_jolts = without_jolts
         self._position_limits, self._period = (position_min, position_max), period
 
     def prepare(self, step: Step) -> None:
@@ -42,7 +50,7 @@ class SlowDown(Part):
         share, robot = step.order.share, step.robot
         if share >= 1.0:
             return
-        if step.fallback is None:
+        if step.fallback is None and not self._without_jolts:
             step.bounds = self.return_bounds(step.bounds, robot.q, robot.v, share)
         step.tasks = [SharedTask(task, step.rest, share) for task in step.tasks]
         step.eased = bounds_near(step.rest, step.commanded(step.bounds), share)

@@ -6,6 +6,7 @@ import pytest
 from adversary import advance, too_fast
 from joint_cases import with_curves
 
+from viability_bounds_pkg.bounds.jerk import JerkBoundsSolver
 from viability_bounds_pkg.bounds.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver
@@ -23,17 +24,23 @@ def random_case(rng):
     return JointLimits(names, -half, half, v_max, a_min, a_max), dt, jerk
 
 
-def excess_in_units_of_d(rng, limits, dt, jerk, margins, factor):
-    """The furthest that any joint goes beyond a limit, an adversary choosing everything."""
+def excess_in_units_of_d(rng, limits, dt, jerk, margins, factor, change=None):
+    """The furthest that any joint goes beyond a limit, an adversary choosing everything.
+
+    Where there is a `change`, accelerations differ from those before by at most that much.
+    """
     velocity_error, position_error = jerk * dt**2 / 8.0, jerk * dt**3 / 12.0
     mean_error = jerk * dt / 36.0
     inner = tightened(limits, margins)
-    solver = BoundsSolver(inner, factor * dt, margins.acceleration, period=dt)
-    q, v = np.zeros(JOINTS), np.zeros(JOINTS)
+    if change is None:
+        solver = BoundsSolver(inner, factor * dt, margins.acceleration, period=dt)
+    else:
+        solver = JerkBoundsSolver(inner, change / dt, dt, factor * dt, margins.with_jerk)
+    q, v, a = np.zeros((3, JOINTS))
     target = rng.choice([-1.0, 1.0], JOINTS)
     excess = speed = -np.inf
     for _ in range(400):
-        bounds = solver.bounds(q, v)
+        bounds = solver.bounds(q, v) if change is None else solver.bounds(q, v, a)
         # Mostly as fast as allowed towards a limit, now and then the other one.
         target *= np.where(rng.random(JOINTS) < 0.01, -1.0, 1.0)
         a = np.where(target > 0.0, bounds.upper, bounds.lower)
@@ -58,6 +65,17 @@ def test_margins_keep_the_limits_against_the_worst_deviations(seed, factor, curv
     excess, speed = excess_in_units_of_d(rng, limits, dt, jerk, torque_margins(jerk, dt), factor)
     assert excess <= -2.0  # in units of the position error of one step
     assert speed <= 1e-12  # rad/s
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_with_a_limited_jerk_the_margins_keep_the_limits_too(factor):
+    rng = np.random.default_rng(4)
+    limits, dt, jerk = random_case(rng)
+    jerk, change = 0.1 * jerk, 10.0 ** rng.uniform(-0.5, 0.5, JOINTS)
+    margins = torque_margins(jerk, dt)
+    margins.position[:] /= 5.0  # D is enough
+    excess, speed = excess_in_units_of_d(rng, limits, dt, jerk, margins, factor, change)
+    assert excess <= 1e-9 and speed <= 1e-12
 
 
 def test_without_the_position_margin_the_limits_break():

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectory
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from viability_bounds_pkg import uncertainty
 from viability_bounds_pkg.baselines import naive_bounds
+from viability_bounds_pkg.bounds.jerk import JerkBoundsSolver
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.ros.runtime import NEWEST_QOS, STATUS_QOS
+from viability_bounds_pkg.ros.runtime import NEWEST_QOS, STATUS_QOS, set_stamp
 from viability_bounds_pkg.testing.ros_harness import joint_state
 from viability_bounds_pkg.viability import BoundsSolver
 
@@ -42,6 +43,7 @@ LIMITS = JointLimits(
     VALUES["acceleration_max"],
 )
 CURVE = {"velocity_offset": [0.2, 0.1, 0.0], "deceleration_limit": [5.0, 3.0, math.inf]}
+JERK = {"jerk_max": [9.0, 9.0, 9.0]}
 REST = [0.0, 0.0, 0.0]
 # Each joint on its way to its upper limit, braking hard enough for the bounds to be narrow.
 NEAR = [0.96, 1.9, 4.0], [0.6, 0.85, 2.95]
@@ -233,6 +235,36 @@ def test_bounds_are_prepared_once_for_each_change(ros, monkeypatch):
     assert len(made) == 2
 
 
+def test_with_a_limited_jerk_it_goes_by_what_was_commanded(ros):
+    robot = BoundsProbe(ros, jerk_max=[100.0, 100.0, 100.0])
+    commands = ros.talk(JointTrajectory, "commanded_accelerations")
+    ros.hears("commanded_accelerations")
+    solver = JerkBoundsSolver(LIMITS, [100.0] * 3, PERIOD, 2.0 * PERIOD)
+    (q, v), zero = map(np.array, NEAR), np.zeros(3)
+    bounds = solver.bounds(q, v, zero)
+    check(robot.ask(10 * MS, q, v), bounds)
+    # Nobody says what was commanded: any of these.
+    bounds = solver.bounds(q, v, bounds.lower, bounds.upper)
+    check(robot.ask(20 * MS, q, v), bounds)
+    last = np.array([-1.2, 0.3, -0.8])
+    for stamp, wrong in ((20, last[:2]), (20, last * math.nan), (10, 2.0 * last), (20, last)):
+        point = JointTrajectoryPoint(accelerations=wrong.tolist())
+        message = JointTrajectory(joint_names=JOINTS, points=[point])
+        set_stamp(message.header.stamp, stamp * MS)
+        commands.publish(message)
+        ros.run_for(0.05)
+    check(robot.ask(30 * MS, q, v), solver.bounds(q, v, last))
+    ros.wait_until(lambda: "not finite" in ros.reported(NODE, "accelerations_refused"))
+    assert "wrong size" in ros.reported(NODE, "accelerations_refused")
+    assert ros.reported(NODE, "last_acceleration_unknown") == "1"
+    # After a restart nothing is known to accelerate the arm.
+    check(robot.ask(ELSEWHERE * 10, q, v), solver.bounds(q, v, zero))
+    ros.accepts(NODE, bounds_dt_factor=1.0)
+    solver = JerkBoundsSolver(LIMITS, [100.0] * 3, PERIOD)
+    check(robot.ask(ELSEWHERE * 20, q, v), solver.bounds(q, v, zero))
+    ros.refuses(NODE, method="naive")
+
+
 def test_a_horizon_that_is_too_long_for_the_limits_is_shortened(shared_ros):
     values = VALUES | {"acceleration_drift": [100.0, 100.0, 100.0], "bounds_dt_factor": 1000.0}
     shared_ros.stop(shared_ros.start(BoundsNode, values))
@@ -257,6 +289,13 @@ def test_a_horizon_that_is_too_long_for_the_limits_is_shortened(shared_ros):
         ({"bounds_dt_factor": math.nan}, "bounds_dt_factor", "nan"),
         ({"missed_deadlines": -1}, "missed_deadlines", "-1; allowed: a whole number"),
         ({"motor_bandwidth": [-1.0, 1.0, 1.0]}, "motor_bandwidth", ">= 0"),
+        ({"jerk_max": [9.0, 0.0, 9.0]}, "jerk_max", "0"),
+        (JERK | {"velocity_error": [0.0, 0.1, 0.0]}, "jerk_max", "none where 'velocity_error'"),
+        (JERK | {"missed_deadlines": 1}, "jerk_max", "none where 'missed_deadlines' is given"),
+        (JERK | {"use_estimated_states": True}, "jerk_max", "none where 'use_estimated_states'"),
+        (JERK | {"method": "naive"}, "jerk_max", "none where 'method' is given"),
+        (JERK | CURVE, "jerk_max", "deceleration_limit of joint 'turn' is 5.0; must be inf"),
+        (JERK | {"acceleration_disturbance": [1.0, 3.9, 0.0]}, "jerk_max", "with this jerk"),
         # Declarations that leave nothing.
         ({"velocity_error": [0.1, 1.2, 0.1]}, "velocity_error", "less at 100 Hz (velocity_error"),
     ],

@@ -152,8 +152,8 @@ class JerkBoundsSolver:
             raise JointLimitsError("state", None, f"of shape {shape}", f"must end with {n}")
         lower, upper = np.empty(shape), np.empty(shape)
         viable = np.empty(shape, dtype=np.bool_)
-        flat = [each.ravel() for each in (*states, lower, upper, viable)]
-        _solve(*flat[:4], self._table, *flat[4:])
+        q, v, a, highest = (each.ravel() for each in states)
+        _solve(q, v, a, highest, self._table, lower.ravel(), upper.ravel(), viable.ravel())
         return AccelerationBounds(lower, upper, viable)
 
 
@@ -166,10 +166,10 @@ def _make_table(
         JointLimitsError: a margin is negative, or too large.
     """
     w = Margins.of(limits, margin, None, None).acceleration
-    for name, each, most in zip(
-        limits.names, w.tolist(), 0.5 * np.minimum(jerk * dt, limits.v_max / dt), strict=True
+    for name, each, speed, drop in zip(
+        limits.names, w.tolist(), limits.v_max / dt, jerk * dt, strict=True
     ):
-        if each > most:
+        if each > (most := 0.5 * _fastest(speed, drop)):
             allowed = f"must be at most {most:.3g} rad/s^2 with this jerk"
             raise JointLimitsError("margin", name, each, allowed)
     table = np.zeros((len(limits), 2), dtype=ONE_SIDED_LIMIT)
@@ -210,17 +210,18 @@ def _largest_braking(name: str, sides: NDArray[np.void]) -> tuple[float, float]:
     """
     dt, drop, v_max, w = (float(sides[0][field]) for field in ("dt", "drop", "v_max", "margin"))
     full, exists = (-sides["low"]).tolist(), np.isfinite(sides["position"]).tolist()
-    length = float(sides["position"].sum())
+    length, (lag, way) = float(sides["position"].sum()), _lag(w, dt, drop)
 
     def limited(most: float) -> tuple[float, float]:
         up, low = (min(b, most) if there else b for b, there in zip(full, exists, strict=True))
         return up, low
 
     def fits(most: float, length: float) -> bool:
-        room, pair = length - 6.0 * w * dt * dt, limited(most)
+        pair = limited(most)
         return all(
             b + w <= _fastest(v_max / dt, drop)
-            and _reach(b + w, 0.0, dt, drop, other - w)[0] <= room
+            and _reach(b + w, 0.0, dt, drop, other - w)[0]
+            <= length - way - _reach(2.0 * w, lag, dt, drop, b - w)[0]
             for b, other, there in zip(pair, pair[::-1], exists, strict=True)
             if there
         )
@@ -234,6 +235,13 @@ def _largest_braking(name: str, sides: NDArray[np.void]) -> tuple[float, float]:
     if low == w:
         raise JointLimitsError("jerk", name, drop / dt, "must leave the joint some braking")
     return limited(low)
+
+
+def _lag(w: float, dt: float, drop: float) -> tuple[float, float]:
+    """Return by how much accelerating is behind braking that begins 2 w higher, rad/s and rad."""
+    steps = np.arange(1.0, ceil(2.0 * w / drop) + 1.0)
+    behind = dt * steps * (2.0 * w - drop * (steps - 1.0))  # in speed, when a step ends
+    return float(behind.max(initial=0.0)), float(dt * behind.sum())
 
 
 @njit(cache=True, error_model="numpy")

@@ -38,6 +38,15 @@ class TorqueMargins(NamedTuple):
         """
         return self._replace(acceleration=0.5 * (1 + periods) * self.acceleration)
 
+    @property
+    def with_jerk(self) -> NDArray[np.float64]:
+        """Margin of the acceleration where the jerk is limited, 7 J dt / 36, shape (n,), rad/s^2.
+
+        J dt / 36 is for the mean. With J dt / 6 more, a step is as far on when it ends as one
+        that is off by D: dt^2 / 2 times that is D.
+        """
+        return 3.5 * self.acceleration
+
 
 def torque_margins(jerk: ArrayLike, dt: float) -> TorqueMargins:
     """Return the margins that make up for the change of acceleration within a step.

@@ -6,6 +6,7 @@ from __future__ import annotations
 import sys
 import time
 from array import array
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -13,22 +14,26 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from viability_bounds_pkg.bounds.last_acceleration import BoundsAfterLast
 from viability_bounds_pkg.node.bounds_parameters import (
     BoundsConfiguration,
     make_bounds,
+    make_jerk_solver,
     make_plausibility_check,
     make_solver,
 )
 from viability_bounds_pkg.robot.configuration import TOPIC
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
-from viability_bounds_pkg.ros.messages import Arrival, JointStateReader, PeriodCheck
+from viability_bounds_pkg.ros.messages import Arrival, JointOrder, JointStateReader, PeriodCheck
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
+from viability_bounds_pkg.ros.refusals import count_refusal
 from viability_bounds_pkg.ros.robot_urdf import warn_of_unusual
-from viability_bounds_pkg.ros.runtime import set_stamp, steady_timer
+from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns, steady_timer
 from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
+    COMMANDED_ACCELERATIONS,
     LIMIT_DISTANCES,
     SLOW_ACCELERATION_LIMITS,
     SLOW_JOINT_STATES,
@@ -41,7 +46,8 @@ _SLOW_PERIOD = 0.05
 class BoundsNode(ArmNode):
     """Answers every joint state with the accelerations that keep the limits for ever.
 
-    Subscribes to ``joint_states`` or ``estimated_joint_states``; publishes
+    Subscribes to ``joint_states`` or ``estimated_joint_states``, and with ``jerk_max`` to
+    ``commanded_accelerations``; publishes
     ``acceleration_limits`` with the stamp of the state that it answers:
     ``points[0].accelerations`` lower, ``points[1].accelerations`` upper, rad/s^2, in the order of
     the parameter ``joints``.
@@ -54,12 +60,15 @@ class BoundsNode(ArmNode):
         super().__init__(**node_arguments)
         with self.starting():
             self._node_parameters = NodeParameters(
-                self, BoundsConfiguration, self._configure, make_bounds
+                self, BoundsConfiguration, self._configure, _check
             )
             config = self._node_parameters.configuration
             if config.robot_description not in ("", TOPIC):
                 warn_of_unusual(self, config, config.read_urdf())
-            self._bounds = make_bounds(config)
+            self._bounds, self._last = make_bounds(config), None
+            if len(config.jerk_max):
+                self._last = BoundsAfterLast(make_jerk_solver(config))
+                self._bounds = self._last.bounds
         joints = config.joints
         check = None
         if not config.use_estimated_states:
@@ -67,6 +76,7 @@ class BoundsNode(ArmNode):
         self._reader = JointStateReader(
             joints, config.state_timeout, self._warn, check, continuous=config.continuous
         )
+        self._gap = 1e9 * config.state_timeout  # ns
         self._period = PeriodCheck(config.dt, self._warn)
         self._answered = 0
         self._outside = np.zeros(len(joints), dtype=int)
@@ -75,6 +85,10 @@ class BoundsNode(ArmNode):
         )
         self._limits = self.stream(ACCELERATION_LIMITS)
         self.listen_to_states(config.use_estimated_states, self._on_state, config.joints)
+        self._order = JointOrder(joints)
+        self._refused: Counter[str] = Counter()
+        if self._last:
+            self.listen(COMMANDED_ACCELERATIONS, self._on_accelerations)
         self._slow_states = SLOW_JOINT_STATES.publisher(self)
         self._slow_limits = SLOW_ACCELERATION_LIMITS.publisher(self)
         self._distances = LIMIT_DISTANCES.publisher(self)
@@ -85,29 +99,38 @@ class BoundsNode(ArmNode):
         self.announce(joints, config.rate_hz, f"method {config.method}")
 
     def _configure(self, config: BoundsConfiguration) -> None:
-        self._bounds = make_bounds(config)
+        if self._last:
+            self._last.solver = make_jerk_solver(config)
+        else:
+            self._bounds = make_bounds(config)
         self._warn_of_reduced_braking(config)
 
     def _warn_of_reduced_braking(self, config: BoundsConfiguration) -> None:
         if config.method != "exact":
             self._warn(f"method '{config.method}' does not keep the limits; it is for comparison")
             return
-        solver = make_solver(config)
+        limited = len(config.jerk_max)
+        solver = make_jerk_solver(config) if limited else make_solver(config)
+        step = "until it can turn" if limited else "within one braking step"
+        why = "Claim 1 of docs/theory/jerk.md" if limited else "condition (11)"
         for name, full, (up, low) in zip(
             config.joints, solver.exact, solver.braking.tolist(), strict=True
         ):
             if not full:
                 self.get_logger().warning(
-                    f"joint '{name}' can cross its range or exceed its speed within one braking "
-                    f"step (condition (11)); its bounds count on decelerations of {up:.3g} before "
-                    f"the upper limit and {low:.3g} before the lower one"
+                    f"joint '{name}' can cross its range or exceed its speed {step} ({why}); its "
+                    f"bounds count on decelerations of {up:.3g} before the upper limit and "
+                    f"{low:.3g} before the lower one"
                 )
 
     def _on_state(self, message: JointState) -> None:
+        before = self._reader.stamp
         arrival = self._reader.read(message, time.monotonic())
         if arrival is Arrival.REFUSED:
             return
         if arrival is Arrival.NEW:
+            if self._last and not 0 < self._reader.stamp - before <= self._gap:
+                self._last.reset()
             bounds = self._bounds(self._reader.q, self._reader.v)
             points = self._answer.points
             points[0].accelerations = array("d", bounds.lower.tobytes())
@@ -117,6 +140,19 @@ class BoundsNode(ArmNode):
                 self._outside += ~bounds.viable
             self._answered += 1
         self._limits.publish(self._answer)
+
+    def _on_accelerations(self, message: JointTrajectory) -> None:
+        """Take what was commanded for the last state; later, it says nothing any more."""
+        reason, detail = self._order.find(message.joint_names)
+        a = np.array([point.accelerations for point in message.points])
+        if not reason and a.shape != (1, len(message.joint_names)):
+            reason = "wrong size"
+        elif not reason and not np.isfinite(a).all():
+            reason = "not finite"
+        if reason:
+            count_refusal(COMMANDED_ACCELERATIONS.name, reason, detail, self._refused, self._warn)
+        elif self._last and stamp_to_ns(message.header.stamp) == self._reader.stamp:
+            self._last.commanded(a[0, self._order.index])
 
     def _publish_slowly(self) -> None:
         """Publish distances to the limits, and copies of the streams, where they are heard."""
@@ -162,12 +198,22 @@ class BoundsNode(ArmNode):
             "states_refused": self._reader.refused,
             "states_outside_kernel_by_joint": self._outside,
         }
+        if self._last:
+            values["last_acceleration_unknown"] = self._last.unknown
+            values["accelerations_refused"] = self._refused
         if self._reader.stamp < 0:
             source = " from estimator_node" if self.uses_estimates else ""
             return DiagnosticStatus.WARN, f"no joint state{source} yet", values
         if self._reader.refused:
             return DiagnosticStatus.WARN, "joint states were refused", values
         return DiagnosticStatus.OK, "answering", values
+
+
+def _check(config: BoundsConfiguration) -> None:
+    """Raise `SettingError` where there are no bounds."""
+    make_bounds(config)
+    if len(config.jerk_max):
+        make_jerk_solver(config)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viability_bounds_pkg import baselines, viability
-from viability_bounds_pkg.bounds.torque_margin import TorqueMargins, torque_margins
+from viability_bounds_pkg.bounds.jerk import JerkBoundsSolver
+from viability_bounds_pkg.bounds.torque_margin import TorqueMargins, tightened, torque_margins
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.parameter import (
@@ -81,6 +82,12 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
     acceleration_drift: Array = joint_amounts(
         "largest jerk under a held torque, for which the bounds keep a margin, rad/s^3; 0 if empty"
     )
+    jerk_max: Array = joint_numbers(
+        "largest change of the commanded accelerations from one control period to the next, "
+        "divided by the period, rad/s^3; no limit if empty",
+        POSITIVE,
+        default=(),
+    )
     declared: DeclaredUncertainty = group(DeclaredUncertainty)
     position_margin: float = number(
         "distance to keep from the position limits, rad",
@@ -103,6 +110,24 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
     state_timeout: float = timeout(
         "silence after which older stamps are accepted again, s", default=0.5
     )
+
+    def __post_init__(self) -> None:
+        """Check also that all that is declared is known to go with a limit of the jerk."""
+        super().__post_init__()
+        if not len(self.jerk_max):
+            return
+        declared = self.declared
+        excluded = {
+            **{each.name: np.any(getattr(declared, each.name)) for each in fields(declared)},
+            "use_estimated_states": self.use_estimated_states,
+            "method": self.method != "exact",
+        }
+        for name in ("acceleration_disturbance", "lasting_disturbance"):
+            del excluded[name]
+        for name, given in excluded.items():
+            if given:
+                allowed = f"none where '{name}' is given: no limit is promised with both"
+                raise SettingError("jerk_max", self.jerk_max, allowed)
 
     @cached_property
     def limits(self) -> JointLimits:
@@ -185,6 +210,23 @@ def make_bounds(config: BoundsConfiguration) -> Bounds:
     if config.method == "exact":
         return make_solver(config).bounds
     return partial(BASELINES[config.method], limits=config.limits, dt=config.horizon)
+
+
+def make_jerk_solver(config: BoundsConfiguration) -> JerkBoundsSolver:
+    """Return the bounds of the jerk that is configured.
+
+    Raises:
+        SettingError: it leaves no bounds.
+    """
+    margins = config.loop.torque_margins
+    margin = margins.with_jerk + config.declared.acceleration_disturbance
+    try:
+        return JerkBoundsSolver(
+            tightened(config.limits, margins), config.jerk_max, config.dt, config.horizon, margin
+        )
+    except JointLimitsError as error:
+        allowed = f"what leaves bounds at {config.rate_hz:g} Hz ({error})"
+        raise SettingError("jerk_max", config.jerk_max, allowed) from error
 
 
 def make_plausibility_check(

@@ -140,6 +140,15 @@ JOINT_COMMANDS = Topic(
     ("bullet_node", "franka_node", "estimator_node", "scenario_node"),
     "`effort`, N m; or `position` without effort: position control by the drives",
 )
+COMMANDED_ACCELERATIONS = Topic(
+    "commanded_accelerations",
+    JointTrajectory,
+    CONTROL_QOS,
+    ("controller_node",),
+    ("bounds_node",),
+    "only where `bounds_node` has `jerk_max`: `points[0].accelerations`, rad/s², that the command "
+    "with the same stamp stands for",
+)
 FT_WRENCH = Topic(
     "ft_wrench",
     WrenchStamped,
@@ -219,6 +228,7 @@ SHARED_TOPICS = (
     ESTIMATED_JOINT_STATES,
     ACCELERATION_LIMITS,
     JOINT_COMMANDS,
+    COMMANDED_ACCELERATIONS,
     FT_WRENCH,
     PAYLOAD,
     LIMIT_DISTANCES,
