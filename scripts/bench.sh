@@ -14,6 +14,7 @@ Ratios compare programs that run in turns in one process. NAME --help lists opti
               machine itself can do; with --loads limits kept while the machine is busy or programs
               stop (20 min)
   peers       limits kept beside TSID, placo and a clamp
+  franka      one period of a Franka arm's nodes, which a simulated FR3 answers
   step        one controller step; with --stages by stage, beside TSID's
   bounds      acceleration bounds: one arm, and batches
 

@@ -6,6 +6,7 @@ import functools
 import re
 import sys
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -114,9 +115,12 @@ def test_nothing_imports_each_other_in_a_circle(depth):
     assert circle(arrows) == []
 
 
-@pytest.mark.parametrize(
-    "kind", [BoundsNode, EstimatorNode, ControllerNode, BulletNode, ScenarioNode]
-)
+NODES = [BoundsNode, EstimatorNode, ControllerNode, BulletNode, ScenarioNode]
+if find_spec("pylibfranka"):  # an extra
+    NODES.append(import_module("franka_bridge.node.franka_node").FrankaNode)
+
+
+@pytest.mark.parametrize("kind", NODES)
 def test_nodes_take_no_name_that_rclpy_uses_itself(kind):
     context = rclpy.Context()
     rclpy.init(context=context)

@@ -74,7 +74,8 @@ class Drive:
             torque_step=_LAW_SHARE * self._step,
         )
         self.clipped = 0
-        self.start(np.zeros(len(limits)), np.zeros(len(limits)), np.zeros(len(limits)))
+        self._sent = np.zeros(len(limits))
+        self._by_law = True  # until commands act by themselves
 
     def tell_load(self, flange: str) -> pin.Inertia:
         """Return the load that the robot is to be told, in the flange's axes; it is told then.
@@ -105,7 +106,7 @@ class Drive:
         return command if self._gravity is None else command + self._gravity(q)
 
     def reported(self, q: Array, measured: Array) -> Array:
-        """Return the torques to report of those that the robot measures, N m."""
+        """Return the torques to report for those that the robot measures, N m."""
         return measured if self._not_reported is None else measured - self._not_reported(q)
 
     def torque(

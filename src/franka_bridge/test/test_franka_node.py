@@ -110,6 +110,19 @@ def test_a_load_is_told_the_robot_between_motions(probe):
     assert ros.reported("franka_node", "payload_told") == "none"
 
 
+def test_a_control_that_the_robot_ends_is_told_and_begins_by_the_service_only(probe, capfd):
+    probe.awaits("stopped")
+    probe.node._arm._robot.stop()
+    probe.awaits("off")
+    seen = len(probe.states)
+    probe.ros.wait_until(lambda: len(probe.states) > seen + 20, "states of a robot that stopped")
+    assert probe.control == "off"
+    told = [line for line in capfd.readouterr().err.splitlines() if "no torque control" in line]
+    assert len(told) == 1 and "preempted" in told[0]
+    assert probe.ros.call(Trigger, "franka_node/recover", Trigger.Request()).success
+    probe.awaits("stopped")
+
+
 def test_a_robot_that_went_is_told_and_comes_back_by_the_service(ros, robot, capfd):
     probe = Probe(ros, robot)
     probe.awaits("stopped")

@@ -181,7 +181,7 @@ class FrankaNode(ArmNode):
             name=self._config.joints,
             position=array("d", state.q),
             velocity=array("d", state.dq),
-            effort=array("d", self._drive.reported(state.q, state.tau_J)),
+            effort=array("d", self._drive.reported(np.array(state.q), np.array(state.tau_J))),
         )
         set_stamp(message.header.stamp, self._stamp)
         self._published_at = time.monotonic()
