@@ -16,6 +16,7 @@ PACKAGES = "viability_bounds_pkg", "torque_safety_controller", "sim_bridge", "fr
 EXTRAS = {
     "moveit_node": ("control_msgs", "apt install ros-jazzy-control-msgs"),
     "franka_node": ("pylibfranka", "source scripts/setup.sh --franka (Python 3.10 to 3.12)"),
+    "simulated_fr3": ("mujoco", "source scripts/setup.sh --franka (Python 3.10 to 3.12)"),
     "franka_stack": ("pylibfranka", "source scripts/setup.sh --franka (Python 3.10 to 3.12)"),
 }
 """What some programs need that is not installed by default, and how it is."""

@@ -7,9 +7,12 @@ from functools import partial
 
 from viability_bounds_pkg.cli.ros_program import run_program
 
-_LIBFRANKA = {"pylibfranka": "source scripts/setup.sh --franka (Python 3.10 to 3.12)"}
-_SIMULATION = {"franky_sim": "source scripts/setup.sh --franka (Python 3.10 to 3.12)"}
+_EXTRA = dict.fromkeys(
+    ("pylibfranka", "franky_sim", "mujoco"),
+    "source scripts/setup.sh --franka (Python 3.10 to 3.12)",
+)
 
-franka_node = partial(run_program, "franka_bridge.node.franka_node", _LIBFRANKA)
-franka_stack = partial(run_program, "franka_bridge.node.franka_stack", _LIBFRANKA)
-simulated_fr3 = partial(run_program, "franka_bridge.node.simulated_fr3", _SIMULATION)
+
+franka_node = partial(run_program, "franka_bridge.node.franka_node", _EXTRA)
+franka_stack = partial(run_program, "franka_bridge.node.franka_stack", _EXTRA)
+simulated_fr3 = partial(run_program, "franka_bridge.node.simulated_fr3", _EXTRA)
