@@ -29,7 +29,7 @@ from torque_safety_controller.limiter import TorqueLimiter
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import SOLVERS, AccelerationRange, InverseDynamicsQP
-from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.robot_model import FrameModel, RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.pose_task import PoseTask
 from torque_safety_controller.tasks.posture_task import PostureTask
@@ -171,10 +171,9 @@ PINOCCHIO = (
 STAGES: dict[str, list[tuple[Any, str]]] = {
     "bounds": [(BoundsSolver, "bounds")],
     "Pinocchio": [(pin, name) for name in PINOCCHIO],
-    "model": [(RobotModel, "update")],
+    "model": [(RobotModel, "update"), (FrameModel, "_read")],
     "tasks": [(PoseTask, "term"), (PostureTask, "term")],
-    "QP built": [(InverseDynamicsQP, "build")],
-    "QP solved": [(InverseDynamicsQP, "solve")],
+    "QP": [(InverseDynamicsQP, "solve")],
     "torque": [(RobotModel, "torque"), (TorqueLimiter, "limited")],
     "parts": [(Goals, "prepare"), (JointBounds, "prepare")],
 }

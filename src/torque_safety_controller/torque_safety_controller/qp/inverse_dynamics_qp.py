@@ -186,26 +186,23 @@ class InverseDynamicsQP:
         self, tasks: Sequence[TaskTerm], contacts: ContactForces | None
     ) -> tuple[Array, Array, float, Array, float]:
         """Return A, b, weight, and b and weight of the joints, as `write_and_solve` takes them."""
-        weights = [0.0, *[task.weight for task in tasks]]
-        if contacts is not None:
-            weights += [task.weight for task in contacts.tasks]
-        greatest = max(weights)
-        if greatest == 0.0:
-            raise NoSolutionFound("no task with a weight above 0")
         # Mostly the last task is of the joints, and there is at most one before it.
-        others, last = tasks, self._no_joints
-        if tasks and tasks[-1].A is None:
-            others, last = tasks[:-1], tasks[-1]
-        if contacts is not None or len(others) > 1 or (others and others[0].A is None):
-            A, b, weight = self._stacked(others, contacts)
-        else:
-            A, b, weight = others[0] if others else self._nothing
-        return A, b, weight / greatest, last.b, last.weight / greatest
+        others, (_, b_joints, weight_joints) = list(tasks), self._no_joints
+        if others and others[-1].A is None:
+            _, b_joints, weight_joints = others.pop()
+        A, b, weight = others[0] if others else self._nothing
+        greatest = max(weight, weight_joints)
+        if contacts is not None or len(others) > 1 or A is None:
+            A, b, weights = self._stacked(others, contacts)
+            weight, greatest = 1.0, max([greatest, *weights])
+        if not greatest > 0.0:
+            raise NoSolutionFound("no task with a weight above 0")
+        return A, b, weight / greatest, b_joints, weight_joints / greatest
 
     def _stacked(
         self, tasks: Sequence[TaskTerm], contacts: ContactForces | None
-    ) -> tuple[Array, Array, float]:
-        """Return terms of accelerations and forces as one of weight 1: A, b and weight."""
+    ) -> tuple[Array, Array, list[float]]:
+        """Return terms of accelerations and forces as one of weight 1: A, b; and their weights."""
         n, r = self._n, 0 if contacts is None else len(contacts.rho_max)
         terms = [(np.eye(n) if A is None else A, b, weight, 0) for A, b, weight in tasks]
         for W, F_des, weight in () if contacts is None else contacts.tasks:
@@ -219,7 +216,7 @@ class InverseDynamicsQP:
             row = sum(map(len, b))
             A[row : row + len(wanted), first : first + part.shape[1]] = root * part
             b.append(root * wanted)
-        return A, np.concatenate(b), 1.0
+        return A, np.concatenate(b), [weight for *_, weight, _ in terms]
 
     def _relaxed(self, program: QuadraticProgram) -> tuple[Array, int]:
         """Return the solution with bounds and constraints relaxed least, and the iterations."""
