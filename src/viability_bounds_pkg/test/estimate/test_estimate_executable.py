@@ -73,13 +73,20 @@ def test_options_reach_the_limits(write_robot, call):
     path = write_robot()
     plain = printed(call(path, "--samples", 300))
     options = "--torque-reserve 0.2 --override wrist=-3,2.5 --cap 5 --drift --method sampling"
+    options += " --torque-rate 900,800"
     ended = call(path, "--samples", 300, *options.split())
     changed = printed(ended)
     assert plain["acceleration_max"][0] > 5.0
     assert changed["acceleration_min"] == [-5.0, -3.0]
     assert changed["acceleration_max"] == [5.0, 2.5]
     assert len(changed["acceleration_drift"]) == 2 and min(changed["acceleration_drift"]) > 0.0
+    assert len(changed["jerk_max"]) == 2 and min(changed["jerk_max"]) > 0.0
     assert "shoulder: a in [-5, 5] rad/s^2 (capped)" in ended.stdout
+    for rate, line in (
+        ("1,2,3", "--torque-rate must be one number, or 2"),
+        ("1e-6", "torque rate of 1e-06 N m/s is too small to keep accelerations"),
+    ):
+        assert line in one_line(call(path, "--samples", 300, "--cap", 5, "--torque-rate", rate))
 
 
 def test_reserve_takes_its_part_of_the_torque(write_robot, call):

@@ -33,8 +33,13 @@ from viability_bounds_pkg.cli.limits_file import (
     rounded,
     write_whole,
 )
-from viability_bounds_pkg.estimate.drift import acceleration_drift
-from viability_bounds_pkg.estimate.worst_case import Array, StateSpace, WorstCases
+from viability_bounds_pkg.estimate.drift import acceleration_drift, jerk_limits
+from viability_bounds_pkg.estimate.worst_case import (
+    Array,
+    LimitEstimateError,
+    StateSpace,
+    WorstCases,
+)
 from viability_bounds_pkg.parameter_files import ParameterFileError
 from viability_bounds_pkg.robot.configuration import list_units
 
@@ -51,6 +56,10 @@ def _fraction(text: str) -> float:
     if not 0 <= value < 1:
         raise argparse.ArgumentTypeError(f"must be at least 0 and less than 1, is {text}")
     return value
+
+
+def _rates(text: str) -> list[float]:
+    return [positive(each) for each in text.split(",")]
 
 
 def _override(text: str) -> tuple[str, tuple[float, float]]:
@@ -119,6 +128,14 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         action="store_true",
         help="also find how fast accelerations drift while a torque is held",
     )
+    add(
+        "--torque-rate",
+        type=_rates,
+        default=[],
+        metavar="RATES",
+        help="largest rates of the torques, N m/s, one number for all joints or one for each, "
+        "separated by commas; also find the jerk that they allow",
+    )
     options = parser.parse_args(arguments)
     if options.seed < 0:
         parser.error(f"argument --seed: must be at least 0, is {options.seed}")
@@ -147,6 +164,8 @@ def _run(options: argparse.Namespace) -> int:
             )
     robot = read_robot(options.parameters)
     names = list(robot.model.names)[1:]
+    if len(options.torque_rate) not in (0, 1, len(names)):
+        raise LimitEstimateError(f"--torque-rate must be one number, or {len(names)}")
     overrides = dict(options.override)
     torque = (1.0 - options.torque_reserve) * robot.tau_max
     space = StateSpace.of(robot.model, robot.q_min, robot.q_max, robot.v_max, torque)
@@ -164,6 +183,17 @@ def _run(options: argparse.Namespace) -> int:
         drift = acceleration_drift(
             robot.model, space, limits.a_min, limits.a_max, seed=options.seed
         )
+    jerk = None
+    if options.torque_rate:
+        print("searching for the least jerk that the torque rates allow ...", flush=True)
+        jerk = jerk_limits(
+            robot.model,
+            space,
+            limits.a_min,
+            limits.a_max,
+            np.broadcast_to(options.torque_rate, len(names)),
+            seed=options.seed,
+        )
     origin = [
         "Limits written by estimate_acceleration_limits, to be passed as a parameter file after "
         f"{options.parameters.name}",
@@ -171,7 +201,7 @@ def _run(options: argparse.Namespace) -> int:
         f"torque reserve {options.torque_reserve:g}",
         f"{list_units(robot.units, '/s^2')}, drift in {list_units(robot.units, '/s^3')}",
     ]
-    text = overlay_text(limits, drift, origin)
+    text = overlay_text(limits, drift, origin, jerk)
     if options.output is None:
         print("\n" + text, end="")
         return 0
@@ -226,13 +256,19 @@ def _vector(values: Array) -> str:
     return "[" + ", ".join(f"{value:.3f}" for value in values) + "]"
 
 
-def overlay_text(limits: AccelerationLimits, drift: Array | None, origin: Sequence[str]) -> str:
+def overlay_text(
+    limits: AccelerationLimits,
+    drift: Array | None,
+    origin: Sequence[str],
+    jerk: Array | None = None,
+) -> str:
     """Return the parameter file with the limits, rounded to the safe side.
 
     Args:
         limits: what to write.
         drift: ``acceleration_drift``, shape (n,), rad/s^3, if it was searched.
         origin: lines of comment that say where the limits come from, and their units.
+        jerk: ``jerk_max``, shape (n,), rad/s^3, if it was searched.
     """
     notes = [*origin]
     if limits.overridden:
@@ -242,6 +278,8 @@ def overlay_text(limits: AccelerationLimits, drift: Array | None, origin: Sequen
         "acceleration_max": rounded(limits.a_max, ROUND_DOWN),
     }
     more = {} if drift is None else {"acceleration_drift": rounded(drift, ROUND_UP)}
+    if jerk is not None:
+        more["jerk_max"] = rounded(jerk, ROUND_DOWN)
     # Not for all nodes at once: a file that names the node would win over that.
     joints = limits.names
     return overlay(joints, found | more, notes) + "\n" + overlay(joints, found, [], CONTROLLER)
