@@ -7,6 +7,9 @@ that it was told, so what is sent is
     sent = tau - g_told(q),    tau = command + g(q), or command where that includes gravity.
 
 A load that the robot does not know yet is in g, not in g_told: then it is part of what is sent.
+
+Commands act by themselves as long as they come, and the limits of torque and torque rate let them
+through. Others go through the stop law, which lets accelerations give way, not single torques.
 """
 
 from __future__ import annotations
@@ -121,20 +124,24 @@ class Drive:
             held: whether the command is one of an earlier period.
             applied: torques that the robot has as the last ones sent, N m.
         """
-        law = self.stop
-        if not self._by_law and (command is None or held):
-            self._start_law(q, v)
-        if command is None:
-            tau = law.torque(q, v)
-        else:
-            tau = np.clip(self.asked(q, command), -self._tau_max, self._tau_max)
-            if self._by_law:
-                tau = law.follow(q, v, tau)
-                self._by_law = held or not law.returned
-        wanted = tau - self._added(q)
+        added, sent = self._added(q), self._sent
         # A step from what was sent last, and from what the robot has if that was lost.
-        lowest = np.maximum(np.maximum(self._sent, applied) - self._step, -self._tau_max)
-        highest = np.minimum(np.minimum(self._sent, applied) + self._step, self._tau_max)
+        lowest = np.maximum(np.maximum(sent, applied) - self._step, -self._tau_max)
+        highest = np.minimum(np.minimum(sent, applied) + self._step, self._tau_max)
+        tau = None
+        if command is not None:
+            tau = np.clip(self.asked(q, command), -self._tau_max, self._tau_max)
+        if not self._by_law:
+            # What motors cannot follow, joint by joint, would move other joints than it should.
+            follows = tau is not None and not held
+            if not (follows and (lowest <= tau - added).all() and (tau - added <= highest).all()):
+                self._start_law(q, v)
+        if tau is None:
+            tau = self.stop.torque(q, v)
+        elif self._by_law:
+            tau = self.stop.follow(q, v, tau)
+            self._by_law = held or not self.stop.returned
+        wanted = tau - added
         sent = np.minimum(np.maximum(wanted, lowest), highest)
         self.clipped += bool((sent != wanted).any())
         self._sent = np.where(np.isfinite(sent), sent, self._sent)

@@ -106,7 +106,9 @@ class Controller:
         return self._last
 
 
-@pytest.mark.parametrize("seed", range(4))
+# In the last one commands ask for more than the limits of torque rates: clipped joint by joint,
+# they would throw other joints.
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 108])
 def test_commands_cut_at_random_end_in_a_stop_within_all_limits(seed):
     rng = np.random.default_rng(seed)
     controller = Controller(rng)
@@ -183,17 +185,14 @@ def test_steps_of_torque_count_from_what_the_robot_has():
     """A packet that was lost is not made up for by a step that is twice as large."""
     arm = Arm([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
     arm.begin()
-    arm.drive.stop._passed_for = 1.0  # commands act by themselves
     for _ in range(200):
         arm.step(np.zeros(7))
     wanted, has = np.full(7, 10.0), np.zeros(7)
-    first = arm.drive.torque(arm.q, arm.v, wanted, False, has).copy()
-    second = arm.drive.torque(arm.q, arm.v, wanted, False, has).copy()
-    np.testing.assert_allclose(first, 1.0, atol=1e-3)
-    np.testing.assert_allclose(second, 1.0, atol=1e-3)
-    np.testing.assert_allclose(
-        arm.drive.torque(arm.q, arm.v, wanted, False, second), 2.0, atol=1e-3
-    )
+    for _ in range(3):
+        sent = arm.drive.torque(arm.q, arm.v, wanted, False, has)
+        assert 0.5 < np.abs(sent - has).max() <= RATE * H
+    sent = arm.drive.torque(arm.q, arm.v, wanted, False, sent)
+    assert np.abs(sent).max() > RATE * H
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
