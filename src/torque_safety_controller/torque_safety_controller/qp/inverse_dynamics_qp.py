@@ -141,9 +141,9 @@ class InverseDynamicsQP:
         elif result.status is Status.INFEASIBLE:
             x, iterations = self._relaxed(program)
             violations = program.violations(x)
-            bounds, rows = violations[:n], violations[len(x) + n :]
-            if max(bounds.max(), rows.max(initial=0.0)) >= _NEGLIGIBLE:
-                relaxation, constraint_relaxation = bounds, rows
+            of_bounds, of_rows = violations[:n], violations[len(x) + n :]
+            if max(of_bounds.max(), of_rows.max(initial=0.0)) >= _NEGLIGIBLE:
+                relaxation, constraint_relaxation = of_bounds, of_rows
         else:
             raise NoSolutionFound("not finite, absurd, or lower limits above upper ones", program)
         return Solution(x[:n], x[n:], relaxation, constraint_relaxation, iterations)
@@ -170,10 +170,10 @@ class InverseDynamicsQP:
                 shapes = f"B {contacts.B.shape}, rho_max {contacts.rho_max.shape}"
                 raise ValueError(f"forces on {n} joints with {shapes}")
         if (k, r) not in self._arrays:
-            size = n + r
-            shapes = (size, size), size, (n + k, size), size + n + k, size + n + k
-            program = QuadraticProgram(*map(np.zeros, shapes))
-            self._arrays[k, r] = program, np.zeros(size + n + k, dtype=np.int32)
+            H, g, C = np.zeros((n + r, n + r)), np.zeros(n + r), np.zeros((n + k, n + r))
+            lower, upper = np.zeros((2, n + r + n + k))
+            program = QuadraticProgram(H, g, C, lower, upper)
+            self._arrays[k, r] = program, np.zeros(len(lower), dtype=np.int32)
         program, active = self._arrays[k, r]
         if constraints is not None:
             program.C[n:, :n] = G
