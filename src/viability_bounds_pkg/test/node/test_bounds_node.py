@@ -265,6 +265,14 @@ def test_with_a_limited_jerk_it_goes_by_what_was_commanded(ros):
     ros.refuses(NODE, method="naive")
 
 
+def test_a_jerk_that_is_too_small_for_all_braking_is_told(ros, capfd):
+    ros.start(BoundsNode, VALUES | {"jerk_max": [20.0, 200.0, 20.0]})
+    lines = capfd.readouterr().err.splitlines()
+    (line,) = (each for each in lines if "jerk_max" in each)
+    assert "joint 'turn' has too small a jerk_max for all of its braking" in line
+    assert "decelerations of 6.12 before the upper limit and 6.12 before the lower one" in line
+
+
 def test_a_horizon_that_is_too_long_for_the_limits_is_shortened(shared_ros):
     values = VALUES | {"acceleration_drift": [100.0, 100.0, 100.0], "bounds_dt_factor": 1000.0}
     shared_ros.stop(shared_ros.start(BoundsNode, values))

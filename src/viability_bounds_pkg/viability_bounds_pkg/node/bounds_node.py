@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from viability_bounds_pkg.bounds.jerk import JerkBoundsSolver
 from viability_bounds_pkg.bounds.last_acceleration import BoundsAfterLast
 from viability_bounds_pkg.node.bounds_parameters import (
     BoundsConfiguration,
@@ -38,6 +39,7 @@ from viability_bounds_pkg.ros.topics import (
     SLOW_ACCELERATION_LIMITS,
     SLOW_JOINT_STATES,
 )
+from viability_bounds_pkg.viability import BoundsSolver
 
 _SLOW_PERIOD = 0.05
 """Between two copies of the streams for tools, s."""
@@ -109,18 +111,20 @@ class BoundsNode(ArmNode):
         if config.method != "exact":
             self._warn(f"method '{config.method}' does not keep the limits; it is for comparison")
             return
-        limited = len(config.jerk_max)
-        solver = make_jerk_solver(config) if limited else make_solver(config)
-        step = "until it can turn" if limited else "within one braking step"
-        why = "Claim 1 of docs/theory/jerk.md" if limited else "condition (11)"
+        if len(config.jerk_max):
+            solver: BoundsSolver | JerkBoundsSolver = make_jerk_solver(config)
+            why = "has too small a jerk_max for all of its braking (docs/theory/jerk.md)"
+        else:
+            solver = make_solver(config)
+            why = "can cross its range or exceed its speed within one braking step "
+            why += "(condition (11))"
         for name, full, (up, low) in zip(
             config.joints, solver.exact, solver.braking.tolist(), strict=True
         ):
             if not full:
                 self.get_logger().warning(
-                    f"joint '{name}' can cross its range or exceed its speed {step} ({why}); its "
-                    f"bounds count on decelerations of {up:.3g} before the upper limit and "
-                    f"{low:.3g} before the lower one"
+                    f"joint '{name}' {why}; its bounds count on decelerations of {up:.3g} before "
+                    f"the upper limit and {low:.3g} before the lower one"
                 )
 
     def _on_state(self, message: JointState) -> None:
