@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 from pylibfranka import (
+    ActiveControlBase,
     FrankaException,
     NetworkException,
     RealtimeConfig,
@@ -79,7 +80,7 @@ class FrankaArm:
         self._address = address
         self._config = RealtimeConfig.kEnforce if real_time else RealtimeConfig.kIgnore
         self._robot: Robot | None = None
-        self._control = None
+        self._control: ActiveControlBase | None = None
         self.lost = 0
         self.state: RobotState = self.connect()
 

@@ -80,6 +80,12 @@ class Drive:
         self._sent = np.zeros(len(limits))
         self._by_law = True  # until commands act by themselves
 
+    @property
+    def load_is_told(self) -> bool:
+        """Whether the robot knows what the arm carries."""
+        payload, told = self.payload, self.told
+        return (payload.link, payload.inertia) == (told.link, told.inertia)
+
     def tell_load(self, flange: str) -> pin.Inertia:
         """Return the load that the robot is to be told, in the flange's axes; it is told then.
 
@@ -128,14 +134,13 @@ class Drive:
         # A step from what was sent last, and from what the robot has if that was lost.
         lowest = np.maximum(np.maximum(sent, applied) - self._step, -self._tau_max)
         highest = np.minimum(np.minimum(sent, applied) + self._step, self._tau_max)
-        tau = None
+        tau, follows = None, False
         if command is not None:
             tau = np.clip(self.asked(q, command), -self._tau_max, self._tau_max)
-        if not self._by_law:
-            # What motors cannot follow, joint by joint, would move other joints than it should.
-            follows = tau is not None and not held
-            if not (follows and (lowest <= tau - added).all() and (tau - added <= highest).all()):
-                self._start_law(q, v)
+            steps = np.clip(tau - added, lowest, highest) - (tau - added)
+            follows = not (held or steps.any())
+        if not (self._by_law or follows):
+            self._start_law(q, v)
         if tau is None:
             tau = self.stop.torque(q, v)
         elif self._by_law:

@@ -108,6 +108,13 @@ def test_a_load_is_told_the_robot_between_motions(probe):
     ros.talk(InertiaStamped, "payload", GOAL_QOS).publish(message)
     ros.wait_until(lambda: ros.reported("franka_node", "payload") == "0.50 kg at fr3_hand")
     assert ros.reported("franka_node", "payload_told") == "none"
+    there = probe.q
+    assert ros.call(Trigger, "franka_node/recover", Trigger.Request()).success
+    ros.wait_until(lambda: ros.reported("franka_node", "payload_told") == "0.50 kg at fr3_hand")
+    probe.awaits("stopped")
+    np.testing.assert_allclose(probe.q, there, atol=2e-3)  # rad
+    seen = len(probe.states)
+    ros.wait_until(lambda: len(probe.states) > seen + 20)
 
 
 def test_a_control_that_the_robot_ends_is_told_and_begins_by_the_service_only(probe, capfd):

@@ -213,6 +213,18 @@ class FrankaNode(ArmNode):
         self._publish_external()
         self._next()
 
+    def _rest(self) -> None:
+        """Bring the arm to rest, if it is under torque control, and end that.
+
+        Raises:
+            FrankaError: the robot has ended it.
+        """
+        arm, end = self._arm, time.monotonic() + _STOP_TIMEOUT
+        while arm.controlled:
+            arm.read()
+            torque = self._torque(None, False)
+            arm.write(torque, self._drive.stop.at_rest or time.monotonic() > end)
+
     def _torque(self, command: Array | None, held: bool) -> list[float]:
         """Return the torques to send for the last state."""
         state = self._arm.state
@@ -249,13 +261,16 @@ class FrankaNode(ArmNode):
             self._diagnostics.publish()
 
     def _on_recover(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, reading = False, self._arm.connected
-        if self._arm.controlled:
+        arm, response.success = self._arm, False
+        if arm.controlled and self._drive.load_is_told:
             response.message = "torque control is on already"
             return response
+        reading, self._waits = arm.connected and not self._waits, False
+        connected = arm.connected
         try:
-            self._arm.recover()
-            if not reading:
+            self._rest()
+            arm.recover()
+            if not connected:
                 self._set_clock()
             self._begin()
         except FrankaError as error:
@@ -268,8 +283,8 @@ class FrankaNode(ArmNode):
 
     def _on_load(self) -> None:
         self.get_logger().info(
-            f"payload {self._drive.payload}: its weight is added here until ~/recover tells the "
-            "robot, which takes loads only without torque control"
+            f"payload {self._drive.payload}: its weight is added here until ~/recover brings the "
+            "arm to rest and tells the robot, which takes loads only without torque control"
         )
 
     # Diagnostics
@@ -313,17 +328,12 @@ class FrankaNode(ArmNode):
 
     def destroy_node(self) -> None:
         """Bring the arm to rest and end the torque control, too."""
-        arm = getattr(self, "_arm", None)
-        end, self._waits = time.monotonic() + _STOP_TIMEOUT, False
-        try:
-            while arm is not None and arm.controlled:
-                arm.read()
-                torque = self._torque(None, False)
-                arm.write(torque, self._drive.stop.at_rest or time.monotonic() > end)
-        except FrankaError as error:
-            self._tell(str(error))
-        if arm is not None:
-            arm.close()
+        if hasattr(self, "_arm"):
+            try:
+                self._rest()
+            except FrankaError as error:
+                self._tell(str(error))
+            self._arm.close()
         super().destroy_node()
 
 

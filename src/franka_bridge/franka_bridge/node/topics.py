@@ -34,6 +34,7 @@ RECOVER = OfferedService(
     "recover",
     Trigger,
     _NODE,
-    "resets the robot's errors, or connects again, and begins torque control: the arm is held",
+    "resets the robot's errors, or connects again, and begins torque control: the arm is held; a "
+    "robot that does not know its load is told it first, at rest",
 )
 SERVICES = (RECOVER,)
