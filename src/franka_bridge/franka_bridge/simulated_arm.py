@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 DT = 1e-3  # s, of libfranka's periods and of the physics
 
 _PATIENCE = 0.5
-"""Time after which an arm that waits for a command looks whether its client is gone, s."""
+"""How long an arm that waits for commands waits for one: libfranka gives up after 1 s, s."""
 
 _POLL = 5e-5  # s
 
@@ -44,17 +44,30 @@ class _Server(FrankaRobotServer):
     def __init__(self, robot: FrankaMujocoRobot, address: str) -> None:
         self.came: list[Array] = []
         self.controlled = False
+        self._last = self._answered = -1  # numbers of states
         super().__init__(robot, [address])
 
     def receive(self) -> bool:
-        """Take what has come; return whether there are torques, or an end of the control."""
+        """Take what has come; return whether the last state is answered, or control has ended."""
         self._process_udp_commands()
-        return bool(self.came) or not self.controlled
+        return self._answered >= self._last or not self.controlled
+
+    def send_state(self) -> None:
+        """Send the next state."""
+        super().send_state()
+        self._last += self.udp_connected
+
+    def reset_state(self) -> None:
+        """Begin with a new client, or with none."""
+        self._last = self._answered = -1
+        self.controlled = False
+        super().reset_state()
 
     def _handle_udp_command(self, command_data: bytes) -> None:
         super()._handle_udp_command(command_data)
         command = UDPCommand.from_bytes(command_data)
         self.controlled = not command.torque_command_finished
+        self._answered = command.message_id
         self.came.append(np.array(command.tau_J_d))
 
 
@@ -69,8 +82,8 @@ class SimulatedArm:
         address: at which it listens, port 1337.
         start: positions, shape (7,), rad.
         watch: of its limits.
-        waits: whether time waits for the commands of a client; else it is that of the wall clock,
-            and a period without a command keeps the last one.
+        waits: whether time waits for the commands of a client, 0.5 s for each; else it is that of
+            the wall clock. A period without a command keeps the last one.
 
     Attributes:
         periods: simulated under torque control.
@@ -156,11 +169,7 @@ class SimulatedArm:
         end = time.monotonic() + _PATIENCE if self._waits else 0.0
         while not self._server.receive():
             if time.monotonic() > end:
-                self._server.process_commands()
-                self._server.controlled &= self._server.tcp_connected
-                if not self._waits:
-                    return
-                end += _PATIENCE
+                return
             time.sleep(_POLL)
 
     def _keep_time(self) -> None:
