@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import yaml
@@ -26,6 +27,8 @@ def main() -> None:
     parser.add_argument("--all", action="store_true", help="also what these robots do not use")
     options = parser.parse_args()
     for path in sorted(CONFIG.glob("*.yaml")):
+        if path.stem == "fr3" and find_spec("franky_sim") is None:
+            continue  # its URDF comes with `setup.sh --franka`
         try:
             loop = DirectLoop(path.stem)
             loop.run(2.0 * loop.dt)

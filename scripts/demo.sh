@@ -10,7 +10,7 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
 
   robot        the name of a parameter file in config/, as baxter_left_arm (default), panda and
                talos_left_arm, or the path of one; scripts/new_robot.sh makes one from a URDF; fr3
-               needs more, see docs/start/franka.md
+               also installs libfranka, see docs/start/franka.md
   scenario     the name in config/scenarios/<robot>_<scenario>.yaml, beside the robot's file, or the
                path of a file, see docs/guides/simulation.md (default: demo; of a robot that has none, it
                holds its start posture for 2 s)
@@ -112,8 +112,10 @@ if [ -z "$out" ]; then
 fi
 
 set +u # ROS' own set-up scripts use unset variables
+# An arm that its maker's protocol connects is simulated by a program of its own.
+simulated="$(sed -n 's/^ *robot_node: *\(simulated_\w*\).*/\1/p' "$config")"
 # shellcheck disable=SC1091
-source "$root/scripts/setup.sh"
+source "$root/scripts/setup.sh" ${simulated:+--franka}
 set -u
 
 # shellcheck disable=SC1091
@@ -167,9 +169,7 @@ stop() {
 trap stop EXIT
 trap 'exit 130' INT TERM HUP
 
-# An arm that its maker's protocol connects is simulated by a program of its own.
 package=sim_bridge driver=bullet_node stack=simulated_stack
-simulated="$(sed -n 's/^ *robot_node: *\(simulated_\w*\).*/\1/p' "$config")"
 if [ -n "$simulated" ]; then
     package=franka_bridge driver=franka_node stack=franka_stack
     overrides+=(-p robot_ip:=127.0.0.1 -p real_time:=false)

@@ -207,21 +207,21 @@ _compile() {
 }
 
 # Scripts source it with their own arguments in place.
-if [ -z "${BASH_SOURCE[1]:-}" ] && [[ "${1:-}" =~ ^(-h|--help)$ ]]; then
+if [ -z "${BASH_SOURCE[1]:-}" ] && [[ ! "${1:-}" =~ ^(--franka)?$ ]]; then
+    [[ "$1" =~ ^(-h|--help)$ ]]
+    _status=$?
+    [ $_status -eq 0 ] || echo "setup: unknown option '$1'" >&2
     _usage
     unset -f _usage _setup _packages _install _fetch _pip _explain _install_pybullet _build _compile
-    return 0 2>/dev/null || exit 0
+    return $_status 2>/dev/null || exit $_status
 fi
-
-_option=
-[ -n "${BASH_SOURCE[1]:-}" ] || _option="${1:-}"
 
 # One at a time: two shells may source this at once.
 exec {_lock}>"$(dirname "${BASH_SOURCE[0]}")/../.setup.lock"
 flock "$_lock"
-_setup "$_option"
+_setup "${1:-}"
 _status=$?
 exec {_lock}>&-
 unset -f _usage _setup _packages _install _fetch _pip _explain _install_pybullet _build _compile
-unset _lock _option
+unset _lock
 (exit $_status)
