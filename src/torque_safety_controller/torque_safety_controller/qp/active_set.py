@@ -86,11 +86,11 @@ def write_and_solve(
             C[i, j] = M[i, j]
         lower[i], upper[i] = a_lower[i], a_upper[i]
         lower[size + i], upper[size + i] = tau_min[i] - h[i], tau_max[i] - h[i]
-    return _solved_by(active, H, g, C, lower, upper, x)
+    return solved_by(active, H, g, C, lower, upper, x)
 
 
 @njit(cache=True)
-def _solved_by(
+def solved_by(
     active: NDArray[np.int32], H: Array, g: Array, C: Array, lower: Array, upper: Array, x: Array
 ) -> bool:
     """Return whether the solution of a program has these limits active; if so, write it to x.
