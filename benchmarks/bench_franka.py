@@ -66,7 +66,7 @@ class Stages:
 
 def watch(stages: Stages, nodes: list[ArmNode]) -> None:
     """Measure the stages of connected nodes."""
-    robot = nodes[0]
+    robot: Any = nodes[0]
     for stream in (stream for node in nodes for stream in node.streams):
         names = LISTENERS.get(stream.topic_name, ())
         stream.listeners[:] = map(stages.timed, names, stream.listeners)
@@ -89,7 +89,7 @@ def main() -> None:
     parser.add_argument("--periods", type=int, default=10_000)
     options = parser.parse_args()
     config = ROOT / "config" / "fr3.yaml"
-    arguments = ["--ros-args", "--params-file", config, "-p", f"robot_ip:={ADDRESS}"]
+    arguments = ["--ros-args", "--params-file", str(config), "-p", f"robot_ip:={ADDRESS}"]
     simulated = subprocess.Popen([ROBOT, *arguments], preexec_fn=as_child)
     robot = {"robot_ip": ADDRESS, "real_time": False}
     rclpy.init()

@@ -341,7 +341,7 @@ def algorithm_4() -> Figure:
     shares = np.delete(found["refined"] / found["sampling"], joints.index("left_s1"))
     figure.metrics = {f"{method}_seconds": each for method, each in seconds.items()}
     figure.metrics["smallest_ratio"] = float(shares.min())
-    space = StateSpace.of(model, *limits, values["torque_max"])
+    space = StateSpace.of(model, *limits, tau_max=values["torque_max"])
     share = figure.metrics["share_of_plain_loop"] = beside_a_plain_loop(model, space)
     figure.add(
         "Algorithm 4, N = 1e6",

@@ -27,8 +27,9 @@ class TorqueLimiter:
         self.tau_max = np.array(tau_max, dtype=float)
         self._limits = -self.tau_max, self.tau_max
         rate = np.asarray(math.inf if tau_rate_max is None else tau_rate_max, dtype=np.float64)
-        self._step = np.where(np.isinf(rate), np.inf, rate * dt)
-        self._rate_limited = bool(np.isfinite(rate).any())
+        finite = np.isfinite(rate)
+        self._step = np.multiply(rate, dt, out=np.full(rate.shape, np.inf), where=finite)
+        self._rate_limited = bool(finite.any())
         self.last: np.ndarray | None = None
 
     def reset(self) -> None:
