@@ -210,3 +210,19 @@ def test_torques_are_finite_and_within_limits_for_any_numbers(bad):
         assert np.isfinite(arm.sent).all()
         assert (np.abs(arm.sent) <= TAU_MAX).all()
         assert np.abs(arm.sent - before).max() <= RATE * H * (1.0 + ROUNDING)
+
+
+def test_the_arm_comes_to_rest_although_torques_come_late():
+    rng = np.random.default_rng(0)
+    arm = Arm([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], [0.2, 0.0, -0.3, 0.0, 0.0, 0.0, 0.0])
+    arm.model.armature = np.array([0.195, 0.195, 0.195, 0.195, 0.074, 0.074, 0.074])  # unknown
+    arm.begin()
+    on_their_way = np.zeros(7)
+    for _ in range(1000):
+        a = pin.aba(arm.model, arm.data, arm.q, arm.v, arm.sent + arm.gravity(arm.known))
+        if rng.random() < 0.85:  # else the state was lost
+            arm.sent = on_their_way
+            on_their_way = arm.drive.torque(arm.q, arm.v, None, False, arm.sent).copy()
+        arm.q, arm.v = arm.q + H * arm.v, arm.v + H * a
+    assert arm.drive.stop.at_rest
+    np.testing.assert_allclose(arm.v, 0.0, atol=5e-3)  # rad/s

@@ -69,6 +69,10 @@ RESERVE = 1.1
 RETURN_SPEED = 0.1
 """Speed of the way back from outside the position limits, as a share of the speed limit."""
 
+SOFT_REST = 0.03
+"""Time constant in which the arm comes to rest at last, where torques may not change at once, s:
+the torque of hard braking, taken off too late, would be the next motion."""
+
 HOLD_GAIN = 30.0
 """omega, 1/s."""
 
@@ -157,6 +161,7 @@ class CoordinatedStop:
         self._lag = lag if lag.any() else None
         given = np.full(len(names), np.inf) if torque_step is None else torque_step
         self._step = joint_array("torque_step", given, limits.names)
+        self._soonest = dt if np.isinf(self._step).all() else max(dt, SOFT_REST)
         clear = np.minimum(HOLD_CLEARANCE, 0.5 * (limits.q_max - limits.q_min))
         self._lowest, self._highest = limits.q_min + clear, limits.q_max - clear
         self.start(np.zeros(len(names)), np.zeros(len(names)))
@@ -311,7 +316,9 @@ class CoordinatedStop:
             if float(np.abs(off).max()) <= GIVE_WAY:
                 return HOLD_GAIN * (HOLD_GAIN * off - 2.0 * v)
             self.at_rest = False
-        return -v * np.maximum(self._clearing(q, v), 1.0 / max(self.time_to_rest(v), self._dt))
+        return -v * np.maximum(
+            self._clearing(q, v), 1.0 / max(self.time_to_rest(v), self._soonest)
+        )
 
     def _clearing(self, q: Array, v: Array) -> Array:
         """Return braking by which joints come to rest before `HOLD_CLEARANCE`, per speed, 1/s.

@@ -41,7 +41,7 @@ def test_speed_limits_of_the_urdf_that_are_left_out_are_told():
     urdf = """<robot name="x"><joint name="a" type="revolute"><position_based_velocity_limits
         deceleration_limit="6.0" velocity_offset="0.652"/></joint></robot>"""
     (line,) = check_with_urdf(read(RobotConfiguration, values), urdf)
-    assert "of a in the URDF is narrower" in line and "0.652 and 6" in line
+    assert "of a in the URDF, 0.652 and 6, is narrower" in line
     values |= {"velocity_offset": [0.652], "deceleration_limit": [6.0]}
     assert not check_with_urdf(read(RobotConfiguration, values), urdf)
     assert not check_with_urdf(read(RobotConfiguration, values), urdf.replace("6.0", "six"))

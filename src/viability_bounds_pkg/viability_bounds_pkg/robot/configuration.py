@@ -338,8 +338,8 @@ def _unusual(config: RobotConfiguration, j: int, joint: ElementTree.Element) -> 
         c, d = speed_limit(joint)
         if config.velocity_offset[j] < c or config.deceleration_limit[j] > d:
             yield (
-                f"<{SPEED_LIMITS}> of {name} in the URDF is narrower than 'velocity_offset' and "
-                f"'deceleration_limit', {c:g} and {d:g}"
+                f"<{SPEED_LIMITS}> of {name} in the URDF, {c:g} and {d:g}, is narrower than "
+                "'velocity_offset' and 'deceleration_limit'"
             )
     start = getattr(config, "start_positions", None)
     low, high = config.position_min[j], config.position_max[j]
