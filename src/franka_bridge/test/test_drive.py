@@ -215,7 +215,7 @@ def test_torques_are_finite_and_within_limits_for_any_numbers(bad):
 def test_the_arm_comes_to_rest_although_torques_come_late():
     rng = np.random.default_rng(0)
     arm = Arm([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], [0.2, 0.0, -0.3, 0.0, 0.0, 0.0, 0.0])
-    arm.model.armature = np.array([0.195, 0.195, 0.195, 0.195, 0.074, 0.074, 0.074])  # unknown
+    arm.model.armature = np.array([0.2, 0.2, 0.2, 0.2, 0.0, 0.0, 0.0])  # unknown
     arm.begin()
     on_their_way = np.zeros(7)
     for _ in range(1000):
