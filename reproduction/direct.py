@@ -66,14 +66,7 @@ class DirectLoop:
         self._changed = dict(changed or {})
         config = self._configuration("bullet_node", BulletConfiguration)
         self.robot = make_robot(config)
-        self.robot.monitor = LimitMonitor(
-            config.position_min,
-            config.position_max,
-            config.velocity_max,
-            config.torque_max,
-            config.velocity_offset,
-            config.deceleration_limit,
-        )
+        self.robot.monitor = LimitMonitor.of(config)
         self.config = config
         self.model = load_model(config, config.urdf)
         bounds = self.declared = self._configuration("bounds_node", BoundsConfiguration)

@@ -11,12 +11,13 @@ branches. `docs/theory/bounds.md` derives them.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace, device
 
-from viability_bounds_pkg.bounds.kernel import AccelerationBounds
+from viability_bounds_pkg.bounds.kernel import ONE_SIDED_LIMIT, AccelerationBounds
 from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError
 from viability_bounds_pkg.viability import BoundsSolver
 
@@ -65,9 +66,12 @@ def bounds(solver: BoundsSolver, q: Array, v: Array) -> AccelerationBounds:
     if q.shape != v.shape or q.shape[-1:] != (n,):
         shapes = f"with q of shape {tuple(q.shape)} and v of shape {tuple(v.shape)}"
         raise JointLimitsError("state", None, shapes, f"both must have shape (..., {n})")
-    table = np.stack([solver.table[name] for name in _Limit._fields])
+    names = ONE_SIDED_LIMIT.names or ()
+    table = np.stack([solver.table[name] for name in names])
     table = xp.asarray(table, dtype=q.dtype, device=device(q))
-    above, below = _Limit(*table[..., 0]), _Limit(*table[..., 1])
+    above, below = (
+        SimpleNamespace(**dict(zip(names, table[..., side], strict=True))) for side in (0, 1)
+    )
     room_above, room_below = above.position - q, below.position + q
     curved = bool(solver.table["offset"].any())
     high, keeps_high = _bound_towards(xp, room_above, v, above, curved)
@@ -79,33 +83,13 @@ def bounds(solver: BoundsSolver, q: Array, v: Array) -> AccelerationBounds:
     return AccelerationBounds(lower, upper, keeps_high & keeps_low & slow)
 
 
-class _Limit(NamedTuple):
-    """A position limit of each joint, arrays of shape (n,); `ONE_SIDED_LIMIT` says which."""
-
-    position: Array
-    dt: Array
-    twice_braking: Array
-    k: Array
-    free: Array
-    v_max: Array
-    low: Array
-    high: Array
-    margin: Array
-    velocity_error: Array
-    tolerance: Array
-    rest: Array
-    offset: Array
-    knee: Array
-    twice_full: Array
-    full_room: Array
-
-
 def _bound_towards(
-    xp: Any, room: Array, v: Array, limit: _Limit, curved: bool
+    xp: Any, room: Array, v: Array, limit: SimpleNamespace, curved: bool
 ) -> tuple[Array, Array]:
     """Return the largest acceleration that keeps a limit, and whether it can be kept.
 
-    `curved`: whether speed limits depend on position.
+    `limit` has arrays of shape (n,), as `ONE_SIDED_LIMIT` says; `curved`: whether speed limits
+    depend on position.
     """
     dt = limit.dt
     fastest = v + limit.velocity_error
@@ -138,7 +122,7 @@ def _bound_towards(
     return a, xp.where(slowest <= 0.0, room + limit.rest >= 0.0, stops)
 
 
-def _end_speed(xp: Any, budget: Array, limit: _Limit, curved: bool) -> Array:
+def _end_speed(xp: Any, budget: Array, limit: SimpleNamespace, curved: bool) -> Array:
     """Return the largest speed at the end of a step from which the limit can be kept."""
     c = limit.twice_braking * xp.clip(budget, 0.0, limit.free)
     w = c / (limit.k + xp.sqrt(limit.k * limit.k + c))
@@ -149,7 +133,7 @@ def _end_speed(xp: Any, budget: Array, limit: _Limit, curved: bool) -> Array:
     return xp.where(w > limit.knee, c / (k + xp.sqrt(k * k + c)), w)
 
 
-def _along_speed_limit(xp: Any, room: Array, v: Array, limit: _Limit) -> Array:
+def _along_speed_limit(xp: Any, room: Array, v: Array, limit: SimpleNamespace) -> Array:
     """Return the acceleration with which a joint touches its speed limit within the step."""
     moves = (v > 0.0) & (limit.offset > 0.0)
     c, d = xp.where(moves, limit.offset, 1.0), 0.5 * limit.twice_braking
@@ -161,7 +145,13 @@ def _along_speed_limit(xp: Any, room: Array, v: Array, limit: _Limit) -> Array:
 
 
 def _resolve_conflict(
-    xp: Any, room_above: Array, room_below: Array, v: Array, low: Array, high: Array, limit: _Limit
+    xp: Any,
+    room_above: Array,
+    room_below: Array,
+    v: Array,
+    low: Array,
+    high: Array,
+    limit: SimpleNamespace,
 ) -> Array:
     """Return the one acceleration to use where the bounds of the two limits contradict."""
     dt, v_max, error = limit.dt, limit.v_max, limit.velocity_error

@@ -21,13 +21,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.bounds.discrete_time import (
-    Margins,
-    checked_step,
-    discrete_time,
-)
+from viability_bounds_pkg.bounds.discrete_time import Margins, checked_step, discrete_time
 from viability_bounds_pkg.bounds.kernel import (
     AccelerationBounds,
+    bounds_of_states,
     knee_speed,
     make_table,
     solve,
@@ -107,14 +104,7 @@ class BoundsSolver:
         Raises:
             JointLimitsError: the shapes differ, or do not fit the number of joints.
         """
-        q = np.asarray(q, dtype=np.float64)
-        v = np.asarray(v, dtype=np.float64)
-        n, shape = len(self.table), q.shape
-        if v.shape != shape or len(shape) not in (1, 2) or shape[-1] != n:
-            shapes = f"with q of shape {q.shape} and v of shape {v.shape}"
-            allowed = f"both must have shape ({n},) or (batch, {n})"
-            raise JointLimitsError("state", None, shapes, allowed)
-        return solve(q, v, self.table)
+        return bounds_of_states(solve, self.table, q, v)
 
     def velocity_range(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return the lowest and highest viable velocity at positions `q`.

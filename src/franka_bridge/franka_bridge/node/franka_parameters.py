@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from franka_bridge.drive import Drive
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
+from viability_bounds_pkg.joint_limits import JointLimitsError
+from viability_bounds_pkg.node.bounds_parameters import limits_of
 from viability_bounds_pkg.parameter import (
     FINITE,
     NEGATIVE,
@@ -144,19 +145,9 @@ def make_drive(config: FrankaConfiguration) -> Drive:
         SettingError: limits that a control period is too long for.
     """
     try:
-        limits = JointLimits(
-            config.joints,
-            config.position_min,
-            config.position_max,
-            config.velocity_max,
-            config.acceleration_min,
-            config.acceleration_max,
-            config.velocity_offset,
-            config.deceleration_limit,
-        )
         return Drive(
             config.model.copy(),
-            limits,
+            limits_of(config),
             config.torque_max,
             config.torque_rate_max,
             config.dt,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.joint_limits import speed_limits
+from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration
 
 Array = NDArray[np.float64]
 
@@ -53,6 +54,18 @@ class LimitMonitor:
         self._sample = np.empty((2, 3, self._q_min.size))
         self._peak: Array = np.empty_like(self._sample)
         self.reset()
+
+    @classmethod
+    def of(cls, robot: LimitedRobotConfiguration) -> LimitMonitor:
+        """Return the monitor of a robot's limits."""
+        return cls(
+            robot.position_min,
+            robot.position_max,
+            robot.velocity_max,
+            robot.torque_max,
+            robot.velocity_offset,
+            robot.deceleration_limit,
+        )
 
     def reset(self) -> None:
         """Forget all updates."""

@@ -96,14 +96,7 @@ class BulletNode(ArmNode):
             self._robot = make_robot(config)
             self._stop = make_stop(config)
         self._config = config
-        self._monitor = LimitMonitor(
-            config.position_min,
-            config.position_max,
-            config.velocity_max,
-            config.torque_max,
-            config.velocity_offset,
-            config.deceleration_limit,
-        )
+        self._monitor = LimitMonitor.of(config)
         self._robot.monitor = self._monitor
         self._dt_ns = round(1e9 * config.dt)
         self._paused = config.start_paused

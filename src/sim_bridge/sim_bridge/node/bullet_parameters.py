@@ -17,7 +17,8 @@ from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.bullet.sensor import SensorConfiguration
 from sim_bridge.hardware import Imperfections, Motors
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
-from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
+from viability_bounds_pkg.joint_limits import JointLimitsError
+from viability_bounds_pkg.node.bounds_parameters import limits_of
 from viability_bounds_pkg.parameter import (
     FINITE,
     NEGATIVE,
@@ -226,19 +227,10 @@ def make_stop(config: BulletConfiguration) -> CoordinatedStop | None:
     if not len(config.acceleration_min):
         return None
     dt, model = config.physics_dt, load_model(config, config.urdf)
-    a_min, a_max = config.acceleration_min, config.acceleration_max
-    clearance = 0.5 * dt * dt * np.maximum(-a_min, a_max)
+    a_max = config.acceleration_max
+    clearance = 0.5 * dt * dt * np.maximum(-config.acceleration_min, a_max)
     try:
-        limits = JointLimits(
-            config.joints,
-            config.position_min + clearance,
-            config.position_max - clearance,
-            config.velocity_max,
-            a_min,
-            a_max,
-            config.velocity_offset,
-            config.deceleration_limit,
-        )
+        limits = limits_of(config, clearance)
         return CoordinatedStop(
             model,
             limits,

@@ -150,14 +150,7 @@ def record(
         q: positions after each control period, shape (N, n), rad.
         v: velocities there, shape (N, n), rad/s.
     """
-    monitor = LimitMonitor(
-        config.position_min,
-        config.position_max,
-        config.velocity_max,
-        config.torque_max,
-        config.velocity_offset,
-        config.deceleration_limit,
-    )
+    monitor = LimitMonitor.of(config)
     robot.monitor = monitor
     robot.reset(q[0], np.zeros(q.shape[1]))
     states = []

@@ -30,14 +30,7 @@ class Stopped:
         config = self.config
         self.robot = make_robot(config)
         self.law = make_stop(config)
-        self.robot.monitor = LimitMonitor(
-            config.position_min,
-            config.position_max,
-            config.velocity_max,
-            config.torque_max,
-            config.velocity_offset,
-            config.deceleration_limit,
-        )
+        self.robot.monitor = LimitMonitor.of(config)
         self.n = len(config.joints)
         self.dt = config.dt / config.substeps
 

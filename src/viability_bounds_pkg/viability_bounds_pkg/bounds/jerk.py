@@ -22,7 +22,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.bounds.discrete_time import Margins, checked_step
-from viability_bounds_pkg.bounds.kernel import AccelerationBounds
+from viability_bounds_pkg.bounds.kernel import AccelerationBounds, bounds_of_states
 from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError, joint_array
 
 Array = NDArray[np.float64]
@@ -142,19 +142,7 @@ class JerkBoundsSolver:
         Raises:
             JointLimitsError: the shapes differ, or do not fit the number of joints.
         """
-        states = [np.asarray(each, dtype=np.float64) for each in (q, v, a)]
-        states.append(states[2] if highest is None else np.asarray(highest, dtype=np.float64))
-        shape, n = states[0].shape, len(self._table)
-        if len(shape) not in (1, 2) or any(each.shape != shape for each in states):
-            shapes = " and ".join(str(each.shape) for each in states)
-            raise JointLimitsError("state", None, f"of shapes {shapes}", "all must be the same")
-        if shape[-1] != n:
-            raise JointLimitsError("state", None, f"of shape {shape}", f"must end with {n}")
-        lower, upper = np.empty(shape), np.empty(shape)
-        viable = np.empty(shape, dtype=np.bool_)
-        q, v, a, highest = (each.ravel() for each in states)
-        _solve(q, v, a, highest, self._table, lower.ravel(), upper.ravel(), viable.ravel())
-        return AccelerationBounds(lower, upper, viable)
+        return bounds_of_states(_solve, self._table, q, v, a, a if highest is None else highest)
 
 
 def _make_table(

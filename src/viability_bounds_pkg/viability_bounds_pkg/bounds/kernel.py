@@ -8,16 +8,17 @@ and velocity change sign, `a_min` and `-a_max` change places.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import inf, sqrt
 from sys import float_info
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.bounds.discrete_time import Margins, without_position_error
-from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits
+from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError
 
 Array = NDArray[np.float64]
 
@@ -142,20 +143,36 @@ def knee_speed(limits: JointLimits, braking: Array) -> Array:
     )
 
 
-def solve(q: Array, v: Array, table: NDArray[np.void]) -> AccelerationBounds:
-    """Return the bounds of states of shape (n,) or (batch, n), rad and rad/s."""
-    lower, upper = np.empty(q.size), np.empty(q.size)
-    viable = np.empty(q.size, dtype=np.bool_)
-    if q.ndim == 1:  # to reshape takes longer than to find the bounds of one arm
-        _solve(q, v, table, lower, upper, viable)
+def bounds_of_states(
+    solve: Callable[..., None], table: NDArray[np.void], *states: ArrayLike
+) -> AccelerationBounds:
+    """Return the bounds of one state of n joints or of a batch of states.
+
+    Args:
+        solve: compiled; takes flat arrays of the states, the table, and arrays to write to.
+        table: constants of the joints, shape (n, 2).
+        states: positions, velocities, and what else there is, all of shape (n,) or (batch, n).
+
+    Raises:
+        JointLimitsError: the shapes differ, or do not fit the number of joints.
+    """
+    arrays = [np.asarray(each, dtype=np.float64) for each in states]
+    n, first = len(table), arrays[0]
+    shape, size = first.shape, first.size
+    if len(shape) not in (1, 2) or shape[-1] != n or any([a.shape != shape for a in arrays]):
+        shapes = " and ".join(str(each.shape) for each in arrays)
+        allowed = f"all must have shape ({n},) or (batch, {n})"
+        raise JointLimitsError("state", None, f"of shapes {shapes}", allowed)
+    lower, upper, viable = np.empty(size), np.empty(size), np.empty(size, dtype=np.bool_)
+    if len(shape) == 1:  # to reshape takes longer than to find the bounds of one arm
+        solve(*arrays, table, lower, upper, viable)
         return AccelerationBounds(lower, upper, viable)
-    _solve(q.ravel(), v.ravel(), table, lower, upper, viable)
-    shape = q.shape
+    solve(*[each.ravel() for each in arrays], table, lower, upper, viable)
     return AccelerationBounds(lower.reshape(shape), upper.reshape(shape), viable.reshape(shape))
 
 
 @njit(cache=True, error_model="numpy")
-def _solve(
+def solve(
     q: Array,
     v: Array,
     table: NDArray[np.void],

@@ -56,12 +56,15 @@ BASELINES = {
 METHODS = ("exact", *BASELINES)
 
 
-def limits_of(config: Any) -> JointLimits:
-    """Return the limits in a configuration that has these fields of `BoundsConfiguration`."""
+def limits_of(config: Any, clearance: Array | float = 0.0) -> JointLimits:
+    """Return the limits in a configuration that has these fields of `BoundsConfiguration`.
+
+    `clearance`: distance to keep from the position limits, shape (n,), rad.
+    """
     return JointLimits(
         config.joints,
-        config.position_min,
-        config.position_max,
+        config.position_min + clearance,
+        config.position_max - clearance,
         config.velocity_max,
         config.acceleration_min,
         config.acceleration_max,
