@@ -208,7 +208,7 @@ def safe_set(axis: plt.Axes, elbow: float) -> None:
     for k, place in enumerate(places):
         for i, speed in enumerate(speeds):
             q[SHOULDER], v[SHOULDER] = place, speed
-            plans = torques.evaluate(q, v, braking_periods(q, v, times, *kept), zero)
+            plans = torques.evaluate(q, v, braking_periods(q, v, times, kept), zero)
             safe[i, k] = ((plans.slack >= 0.0) & (plans.beyond <= 0.0)).any()
     axis.contourf(places, speeds, safe, levels=[0.5, 1.5], colors=["tab:green"], alpha=0.4)
     for sign, end in ((1.0, limits.q_max[SHOULDER]), (-1.0, limits.q_min[SHOULDER])):

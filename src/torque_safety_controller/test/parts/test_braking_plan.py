@@ -22,8 +22,7 @@ CURVED = LIMITS._replace(velocity_offset=np.full(N, 0.3), deceleration_limit=0.8
 
 def sampled(q, v, periods, limits=LIMITS):
     """States of a plan at its samples, and by how far it passes limits."""
-    low, high, tolerance, _, *others = limits
-    _, *states, beyond = sample(q, v, periods[np.newaxis], low, high, tolerance, *others)
+    _, *states, beyond = sample(q, v, periods[np.newaxis], limits)
     return [each[0] for each in states], beyond[0]
 
 
@@ -50,7 +49,7 @@ def random_state(seed):
 def test_a_plan_ends_within_the_limits_and_its_rest_is_a_plan(seed):
     """What makes one plan, once found, enough for ever: period by period until it stands."""
     q, v = random_state(seed)
-    periods = braking_periods(q, v, np.array([0.2 * (seed + 1)]), *LIMITS)[0]
+    periods = braking_periods(q, v, np.array([0.2 * (seed + 1)]), LIMITS)[0]
     (positions, velocities, _), beyond = sampled(q, v, periods)
     assert beyond == 0.0
     assert not velocities[-1].any()
@@ -78,7 +77,7 @@ def test_plans_keep_speed_limits_that_depend_on_position(seed):
         room = HIGH - (q + 0.5 * t * (v + speed))
         return np.max((speed + c) ** 2 / (2.0 * d) - room - CURVED.tolerance, axis=0)
 
-    longest = braking_periods(q, v, np.array([9.0]), *CURVED)[0]
+    longest = braking_periods(q, v, np.array([9.0]), CURVED)[0]
     hardest = np.ceil(v / (BRAKING * DT))
     assert (too_near(longest) <= 1e-9).all()
     chosen = longest > hardest  # the others only just stop in time
@@ -101,8 +100,8 @@ def test_bounds_are_narrowed_to_the_last_acceleration_from_which_a_joint_can_sto
     """Against the definition: at each end, and just outside."""
     q, v = random_state(seed)
     free, far = np.full(N, np.inf), np.full(N, 1e4)
-    _, highest = narrow(q, v, -far, -free, free, LOW, HIGH, BRAKING, DT, *NONE)
-    lowest, _ = narrow(q, v, far, -free, free, LOW, HIGH, BRAKING, DT, *NONE)
+    _, highest = narrow(q, v, -far, -free, free, LIMITS)
+    lowest, _ = narrow(q, v, far, -free, free, LIMITS)
     for sign, ends, limit in ((1.0, highest, HIGH), (-1.0, -lowest, -LOW)):
         for j in range(N):
             for a, expected in ((ends[j], False), (ends[j] + 1e-3, True)):

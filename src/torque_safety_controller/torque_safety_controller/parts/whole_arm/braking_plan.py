@@ -60,18 +60,7 @@ class PlanLimits(NamedTuple):
 
 
 @njit(cache=True)
-def braking_periods(
-    q: Array,
-    v: Array,
-    times: Array,
-    q_min: Array,
-    q_max: Array,
-    tolerance: Array,
-    braking: Array,
-    dt: float,
-    velocity_offset: Array,
-    deceleration_limit: Array,
-) -> Array:
+def braking_periods(q: Array, v: Array, times: Array, limits: PlanLimits) -> Array:
     """Return in how many periods each joint stands in the plans of given times.
 
     A joint takes longer where it would have to brake harder than `braking`, and less where it
@@ -81,17 +70,12 @@ def braking_periods(
         q: positions, shape (n,), rad.
         v: velocities, shape (n,), rad/s.
         times: shape (plans,), s.
-        q_min: lowest positions at which joints are to stand, shape (n,), rad.
-        q_max: highest, shape (n,), rad.
-        tolerance: as in `PlanLimits`, shape (n,), rad.
-        braking: as in `PlanLimits`, shape (n,), rad/s^2.
-        dt: control period, s.
-        velocity_offset: as in `PlanLimits`, shape (n,), rad/s.
-        deceleration_limit: as in `PlanLimits`, shape (n,), rad/s^2.
+        limits: that the plans keep.
 
     Returns:
         Periods, at least 1, shape (plans, n).
     """
+    q_min, q_max, tolerance, braking, dt, offset, deceleration = limits
     periods = np.empty((times.size, q.size))
     for j in range(q.size):
         speed = abs(v[j])
@@ -99,7 +83,7 @@ def braking_periods(
         most = np.inf
         if 0.5 * dt * speed > 0.0:
             room = q_max[j] - q[j] if v[j] > 0.0 else q[j] - q_min[j]
-            curve = velocity_offset[j], deceleration_limit[j]
+            curve = offset[j], deceleration[j]
             inside = _periods_within(room, speed, dt, curve)
             tolerated = _periods_within(room + tolerance[j], speed, dt, curve)
             most = max(inside, min(hardest, tolerated), 1.0)
@@ -132,17 +116,7 @@ def _room_needed(speed: float, deceleration: float, c: float, d: float) -> float
 
 @njit(cache=True)
 def narrow(
-    q: Array,
-    v: Array,
-    plan: Array,
-    lower: Array,
-    upper: Array,
-    q_min: Array,
-    q_max: Array,
-    braking: Array,
-    dt: float,
-    velocity_offset: Array,
-    deceleration_limit: Array,
+    q: Array, v: Array, plan: Array, lower: Array, upper: Array, limits: PlanLimits
 ) -> tuple[Array, Array]:
     """Return acceleration bounds, narrowed to those after which each joint by itself can stop.
 
@@ -160,23 +134,19 @@ def narrow(
         plan: accelerations of the plan in hand, which are always allowed, shape (n,), rad/s^2.
         lower: bounds, shape (n,), rad/s^2.
         upper: shape (n,), rad/s^2.
-        q_min: lowest positions at which joints are to stand, shape (n,), rad.
-        q_max: highest, shape (n,), rad.
-        braking: as in `PlanLimits`, shape (n,), rad/s^2.
-        dt: control period, s.
-        velocity_offset: as in `PlanLimits`, shape (n,), rad/s.
-        deceleration_limit: as in `PlanLimits`, shape (n,), rad/s^2.
+        limits: of the plans.
 
     Returns:
         Lower and upper bounds, shape (n,), rad/s^2; where nothing within those given is possible,
         what is nearest to them.
     """
+    q_min, q_max, _, braking, dt, offsets, decelerations = limits
     low, high = np.empty_like(lower), np.empty_like(upper)
     for j in range(q.size):
         A = braking[j]
         for sign in (-1.0, 1.0):
             room = q_max[j] - q[j] if sign > 0.0 else q[j] - q_min[j]
-            offset, d = velocity_offset[j], deceleration_limit[j]
+            offset, d = offsets[j], decelerations[j]
             room -= 0.5 * offset * offset / d
             c = min((2.0 * room - sign * v[j] * dt) / (A * dt * dt), _FAR)
             h = max(ceil(np.sqrt(max(1.0 + c, 0.0))) - 1.0, 0.0)
@@ -217,15 +187,7 @@ FIRST, AT_REST = 0, -1
 
 @njit(cache=True)
 def sample(
-    q: Array,
-    v: Array,
-    periods: Array,
-    q_min: Array,
-    q_max: Array,
-    tolerance: Array,
-    dt: float,
-    velocity_offset: Array,
-    deceleration_limit: Array,
+    q: Array, v: Array, periods: Array, limits: PlanLimits
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the states of plans, as in `Samples`, and by how far they pass position limits.
 
@@ -235,17 +197,13 @@ def sample(
         q: positions at the beginning, shape (n,), rad.
         v: velocities, shape (n,), rad/s.
         periods: in which each joint stands, shape (plans, n).
-        q_min: lowest positions at which joints are to stand, shape (n,), rad.
-        q_max: highest, shape (n,), rad.
-        tolerance: as in `PlanLimits`, shape (n,), rad.
-        dt: control period, s.
-        velocity_offset: as in `PlanLimits`, shape (n,), rad/s.
-        deceleration_limit: as in `PlanLimits`, shape (n,), rad/s^2.
+        limits: of the plans.
 
     Returns:
         Samples; and the largest excess of a position beyond the tolerance, 0 for none, rad, shape
         (plans,).
     """
+    q_min, q_max, tolerance, _, dt, offset, deceleration = limits
     plans, n = periods.shape
     clock = np.empty((plans, UNIFORM + 2 * n + 1))
     positions = np.empty((plans, clock.shape[1], n))
@@ -263,7 +221,7 @@ def sample(
             time = dt * periods[i, j]
             way = 0.5 * v[j] * time
             excess = max(max(q[j], q[j] + way) - q_max[j], q_min[j] - min(q[j], q[j] + way))
-            c, d = velocity_offset[j], deceleration_limit[j]
+            c, d = offset[j], deceleration[j]
             if c > 0.0 and v[j] != 0.0:
                 room = q_max[j] - q[j] if v[j] > 0.0 else q[j] - q_min[j]
                 needed = _room_needed(abs(v[j]), abs(v[j]) / time, c, d)
@@ -322,8 +280,7 @@ class PlanTorques:
             periods: shape (plans, n).
             extra: torque that the motors give besides that of the model, shape (n,), N m.
         """
-        q_min, q_max, tolerance, _, dt, c, d = self._limits
-        *states, beyond = sample(q, v, periods, q_min, q_max, tolerance, dt, c, d)
+        *states, beyond = sample(q, v, periods, self._limits)
         samples = Samples(*states)
         n = q.size
         tau = np.empty_like(samples.q)

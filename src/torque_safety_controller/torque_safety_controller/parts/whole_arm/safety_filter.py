@@ -250,10 +250,7 @@ class SafetyFilter(Part):
         self._most_beyond = float(plans.beyond[chosen])
         self.plan = plans.samples.a[chosen, FIRST]
         self.rest_torque = plans.tau[chosen, AT_REST]
-        q_min, q_max, _, braking, dt, c, d = self._limits
-        self.lower, self.upper = narrow(
-            q, v, self.plan, lower, upper, q_min, q_max, braking, dt, c, d
-        )
+        self.lower, self.upper = narrow(q, v, self.plan, lower, upper, self._limits)
         most = float((plans.peaks[chosen] * self._of_limit).max())
         self.lost = not most <= 1.0 + LOST
         return self._rows(plans, chosen) if most <= 1.0 else None
@@ -291,7 +288,7 @@ class SafetyFilter(Part):
     def _first_plan(self) -> tuple[BrakingPlans, int]:
         """Return the plans of `FIRST_TIMES`, and the first that is safe, or else the best."""
         q, v = self._state
-        periods = braking_periods(q, v, np.array(FIRST_TIMES), *self._limits)
+        periods = braking_periods(q, v, np.array(FIRST_TIMES), self._limits)
         plans = self._plans.evaluate(q, v, periods, self._extra)
         safe = plans.slack >= 0.0
         chosen = int(np.argmax(safe if safe.any() else plans.slack))
@@ -309,7 +306,7 @@ class SafetyFilter(Part):
         fine = np.maximum(high - limits.q_max, limits.q_min - low) <= DRIFT * limits.tolerance
         rows = periods[np.newaxis]
         if not fine.all():
-            fresh = braking_periods(q, v, np.array([self._time]), *limits)
+            fresh = braking_periods(q, v, np.array([self._time]), limits)
             rows = np.concatenate([rows, np.where(fine, periods, fresh)])
         plans = self._plans.evaluate(q, v, rows, self._extra)
         better = len(rows) > 1 and (
@@ -355,7 +352,7 @@ class SafetyFilter(Part):
         now, dt = self._time, self._dt
         times = [now, other] if dt <= other <= LONGEST_TIME else [now]
         q, v = self._state.after(a, dt)
-        fresh = braking_periods(q, v, np.array(times), *self._limits)
+        fresh = braking_periods(q, v, np.array(times), self._limits)
         times.append(max(now - dt, dt))
         plans = self._plans_after(a, np.concatenate([fresh, self._rest[np.newaxis]]))
         peaks = plans.peaks * plans.peaks
