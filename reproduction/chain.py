@@ -22,9 +22,8 @@ from sim_bridge.scenario.report import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
-from viability_bounds_pkg.parameter_files import YamlError, read_yaml
+from viability_bounds_pkg.parameter_files import YamlError, read_yaml, remember_arguments
 from viability_bounds_pkg.ros.arm_node import connect
-from viability_bounds_pkg.ros.given_parameters import remember_arguments
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = {

@@ -15,7 +15,7 @@ from sim_bridge.node.bullet_node import BulletNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.parameter import parameter_table, read
-from viability_bounds_pkg.ros.given_parameters import remember_arguments
+from viability_bounds_pkg.parameter_files import remember_arguments
 from viability_bounds_pkg.testing.ros_harness import overrides, private_domain, read_config
 
 RATES = [1e3, 1e9, 1e-9, 1.0, 2.0, 3.0, 4.0]

@@ -19,8 +19,7 @@ from torque_safety_controller.qp import (
     Solution,
 )
 from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.settings import Settings
-from torque_safety_controller.step import Part, Step
+from torque_safety_controller.step import Part, Settings, Step
 from torque_safety_controller.supervisor import Order
 from viability_bounds_pkg.state import State
 

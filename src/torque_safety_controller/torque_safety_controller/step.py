@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -11,6 +12,8 @@ import pinocchio as pin
 from numba import njit
 from numpy.typing import NDArray
 
+from torque_safety_controller.friction.settings import FrictionSettings
+from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.qp import (
     AccelerationRange,
     ContactForces,
@@ -18,14 +21,32 @@ from torque_safety_controller.qp import (
     Solution,
 )
 from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.settings import Settings
 from torque_safety_controller.supervisor import Order
+from torque_safety_controller.tasks.admittance import InteractionSettings
+from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.task import Task
 
 Array = NDArray[np.float64]
 
 LONGEST_GAP = 2.5
 """Periods that a step may take, a missed deadline being 2; nothing is learned from longer ones."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a controller and its parts that are live.
+
+    Attributes:
+        gains: of the tasks.
+        integral: of the integral action.
+        friction: of the friction compensation.
+        interaction: of forces at the hand.
+    """
+
+    gains: Gains
+    integral: IntegralSettings
+    friction: FrictionSettings
+    interaction: InteractionSettings
 
 
 class Step:

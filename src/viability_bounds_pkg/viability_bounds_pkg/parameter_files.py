@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter files: YAML as rcl takes it, and mistakes that rcl ignores, each told in one line."""
+"""Parameter files: YAML as rcl takes it, and mistakes that rcl ignores, each told in one line.
+
+rcl keeps 500 where 250.0 or a word is given later, lets the section of one node in a file win over
+a later ``-p name:=value``, and reads null as the string "null". Here the last value given counts,
+and null is none.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +12,10 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import yaml
 
@@ -31,6 +38,7 @@ NODES = (
 """Nodes of this project."""
 
 _VALUES = "ros__parameters"
+_ARGUMENTS: WeakKeyDictionary[Any, Sequence[str]] = WeakKeyDictionary()
 
 
 class YamlError(ArmSafetyError, ValueError):
@@ -209,3 +217,31 @@ def unknown_parameters(given: Iterable[str], known: Iterable[str] = ()) -> str:
     every = {*known, *parameter_names()}
     unknown = sorted(set(given) - every)
     return "; ".join(f"unknown parameter '{each}'{did_you_mean(each, every)}" for each in unknown)
+
+
+def remember_arguments(context: Any, arguments: Sequence[str]) -> None:
+    """Remember the command line that an rclpy context was initialised with."""
+    _ARGUMENTS[context] = arguments
+
+
+def given_parameters(context: Any, node: str) -> dict[str, Any]:
+    """Return the values given for a node, by parameter, the last one of each.
+
+    Args:
+        context: of rclpy.
+        node: its fully qualified name, such as ``/left/bounds_node``.
+
+    Raises:
+        YamlError: a file cannot be read, or a value is no YAML.
+        ParameterFileError: a file is no parameter file.
+    """
+    values: dict[str, Any] = {}
+    for flag, text in pairwise(_ARGUMENTS.get(context, ())):
+        if flag == "--params-file":
+            values |= values_for(text, node)
+        elif flag in ("-p", "--param"):
+            name, _, value = text.partition(":=")
+            of, _, name = name.rpartition(":")
+            if not of or is_section_of(f"/**/{of}", node):
+                values[name] = load_yaml(value)
+    return values

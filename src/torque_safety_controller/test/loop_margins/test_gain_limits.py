@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from torque_safety_controller.integral_feedback.leaky_integrator import LeakyIntegrator
-from torque_safety_controller.loop_margins.joint_loop import (
+from torque_safety_controller.loop_margins import (
     Feedback,
     Link,
     filter_share,

@@ -20,8 +20,8 @@ from torque_safety_controller.node.declared import (
 )
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.tasks.gains import critical_damping
+from viability_bounds_pkg.parameter_files import remember_arguments
 from viability_bounds_pkg.robot.files import read_urdf
-from viability_bounds_pkg.ros.given_parameters import remember_arguments
 from viability_bounds_pkg.ros.runtime import LATCHED_QOS
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import (

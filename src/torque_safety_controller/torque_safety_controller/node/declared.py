@@ -8,7 +8,7 @@ from rclpy.node import Node
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.ros.given_parameters import given_parameters
+from viability_bounds_pkg.parameter_files import given_parameters
 
 UNDECLARED = 1
 """Missed periods that the bounds cover by their defaults."""

@@ -22,7 +22,7 @@ from torque_safety_controller.parameters.contact_parameters import (
 )
 from torque_safety_controller.parts.whole_arm.braking_plan import RESERVE
 from torque_safety_controller.qp import SOLVERS
-from torque_safety_controller.settings import Settings
+from torque_safety_controller.step import Settings
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (

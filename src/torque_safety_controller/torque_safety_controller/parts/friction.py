@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from torque_safety_controller.friction.settings import GAIN, FrictionSettings
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.settings import Settings
-from torque_safety_controller.step import Part, Step
+from torque_safety_controller.step import Part, Settings, Step
 
 Array = NDArray[np.float64]
 

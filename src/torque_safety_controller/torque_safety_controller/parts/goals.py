@@ -11,8 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.settings import Settings
-from torque_safety_controller.step import Part, Step, too_weak_at
+from torque_safety_controller.step import Part, Settings, Step, too_weak_at
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.pose_task import (
     PoseMotion,

@@ -28,8 +28,7 @@ from torque_safety_controller.integral_feedback.nullspace import NullspaceCompli
 from torque_safety_controller.integral_feedback.printed import PrintedCompliance
 from torque_safety_controller.integral_feedback.stable_gain import StableGain
 from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.settings import Settings
-from torque_safety_controller.step import LONGEST_GAP, Part, Step, joints_named
+from torque_safety_controller.step import LONGEST_GAP, Part, Settings, Step, joints_named
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.loop_margins.arm_inertia import ArmInertia
-from torque_safety_controller.loop_margins.joint_loop import (
+from torque_safety_controller.loop_margins import (
+    ArmInertia,
     Feedback,
     Link,
     limit_gains,

@@ -11,14 +11,26 @@ import argparse
 import math
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from torque_safety_controller.new_robot.capsules import capsule_entries
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError, find_chain
 from torque_safety_controller.new_robot.estimates import Estimates, estimate
 from torque_safety_controller.new_robot.files import parameter_file, scenario_file
+from torque_safety_controller.new_robot.hardware import (
+    ERRORS,
+    QUICKEST,
+    ROOM,
+    Array,
+    Errors,
+    acceleration_errors,
+    imperfect_file,
+    with_rotors,
+)
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.new_robot.urdf import (
     shapes,
@@ -27,10 +39,10 @@ from torque_safety_controller.new_robot.urdf import (
     without_comments,
 )
 from torque_safety_controller.tools.fit_capsules import with_capsules
-from torque_safety_controller.tools.gain_limits import OBSERVER
-from torque_safety_controller.tools.imperfect_robot import imperfect_text
+from torque_safety_controller.tools.gain_limits import HORIZON, OBSERVER
 from torque_safety_controller.tools.suitable_gains import (
     GAINS,
+    IMPERFECT_GAINS,
     OBSERVER_MAX,
     OBSERVER_PERIODS,
     Gains,
@@ -38,11 +50,8 @@ from torque_safety_controller.tools.suitable_gains import (
 )
 from viability_bounds_pkg.cli.command_line import Parser, number, positive, run_tool, stage
 from viability_bounds_pkg.cli.limits_file import check_writable, write_whole
-from viability_bounds_pkg.robot.files import (
-    parsed_urdf,
-    resolve_uri,
-    urdf_text,
-)
+from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.robot.files import parsed_urdf, resolve_uri, urdf_text
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -187,7 +196,7 @@ def _run(options: argparse.Namespace) -> int:
     if not options.ideal:
         with stage("making an imperfect robot"):
             try:
-                texts["imperfect"] = imperfect_text(chain, estimates, gains, urdf, robot_text)
+                texts["imperfect"] = _imperfect_text(chain, estimates, gains, urdf, robot_text)
             except NewRobotError as error:
                 print(error)
                 del files["imperfect"]
@@ -197,6 +206,57 @@ def _run(options: argparse.Namespace) -> int:
     for name, path in files.items():
         print(f"written: {path} ({name})")
     return 0
+
+
+def _imperfect_text(
+    chain: Chain,
+    exact: Estimates,
+    gains: Gains,
+    urdf: str,
+    exact_text: Callable[[Gains, str], str],
+) -> str:
+    """Return the file of an imperfect robot, with the largest errors that leave bounds.
+
+    Args:
+        chain: the arm.
+        exact: its limits without rotors and errors.
+        gains: in its own file.
+        urdf: text of its URDF.
+        exact_text: returns its own file, with gains and the place of the URDF.
+
+    Raises:
+        NewRobotError: no errors leave bounds.
+    """
+    real = with_rotors(chain, exact.v_max)
+    estimates = estimate(real, exact.rate_hz)
+    quickest = QUICKEST * estimates.v_max
+    estimates = replace(
+        estimates,
+        a_min=np.maximum(estimates.a_min, -quickest),
+        a_max=np.minimum(estimates.a_max, quickest),
+    )
+    reason = "they take too much of the acceleration limits"
+    for errors in ERRORS:
+        disturbance = acceleration_errors(real, estimates, errors)
+        if (disturbance > ROOM * np.minimum(-estimates.a_min, estimates.a_max)).any():
+            continue
+
+        def texts(
+            own: Gains, place: str, errors: Errors = errors, disturbance: Array = disturbance
+        ) -> list[str]:
+            changed = {name: value for name, value in own.items() if gains.get(name) != value}
+            imperfect = imperfect_file(real, estimates, errors, disturbance, changed)
+            return [exact_text(gains, place), imperfect]
+
+        try:
+            begin = {**gains, **IMPERFECT_GAINS, HORIZON: errors.horizon}
+            return texts(suitable_gains(urdf, texts, begin), "")[1]
+        except ArmSafetyError as error:  # they leave no bounds, or no gains suit
+            reason = str(error)
+    raise NewRobotError(
+        f"no imperfect robot at {exact.rate_hz:g} Hz: with the least errors {reason}; a higher "
+        "--rate, or a file of your own like those in config/imperfect"
+    )
 
 
 def _tell_chain(chain: Chain) -> None:

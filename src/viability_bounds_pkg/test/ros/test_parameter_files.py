@@ -10,12 +10,13 @@ from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.parameter_files import (
     ParameterFileError,
     YamlError,
+    given_parameters,
     is_section_of,
     load_yaml,
     node_parameters,
     read_sections,
+    remember_arguments,
 )
-from viability_bounds_pkg.ros.given_parameters import given_parameters, remember_arguments
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ from viability_bounds_pkg.parameter import (
     texts,
     whole_number,
 )
+from viability_bounds_pkg.parameter_files import remember_arguments
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.given_parameters import remember_arguments
 from viability_bounds_pkg.ros.parameters import NodeParameters, UnknownParameterError
 from viability_bounds_pkg.testing.ros_harness import overrides
 

@@ -14,7 +14,7 @@ from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.ros.given_parameters import given_parameters
+from viability_bounds_pkg.parameter_files import given_parameters
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import steady_timer
 from viability_bounds_pkg.ros.streams import Input, Queue, Stream

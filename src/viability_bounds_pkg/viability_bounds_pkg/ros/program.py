@@ -21,9 +21,8 @@ from rclpy.task import Future
 from viability_bounds_pkg.cli.command_line import Parser
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import parameter_table
-from viability_bounds_pkg.parameter_files import read_sections
+from viability_bounds_pkg.parameter_files import read_sections, remember_arguments
 from viability_bounds_pkg.ros.arm_node import ArmNode, StartError, connect
-from viability_bounds_pkg.ros.given_parameters import remember_arguments
 from viability_bounds_pkg.ros.runtime import (
     EventsExecutor,
     make_executor,

@@ -21,8 +21,7 @@ from torque_safety_controller.parts.contact.contacts import FrictionContact
 from torque_safety_controller.parts.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.settings import Settings
-from torque_safety_controller.step import Part, Step
+from torque_safety_controller.step import Part, Settings, Step
 from torque_safety_controller.tasks.admittance import (
     AdmittanceTask,
     InteractionSettings,

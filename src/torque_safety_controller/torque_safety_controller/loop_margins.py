@@ -6,6 +6,8 @@
 All of it is linear, and sampled once a control period. Each quantity is a row vector, what it is
 made of: of the state of the loop and of the command that enters at the motor. One step of the
 loop, written with such rows, gives its matrices. `docs/guides/tuning.md` derives it.
+
+`ArmInertia` has what couples the loops of several joints.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
@@ -23,6 +26,7 @@ Array = NDArray[np.float64]
 _FREQUENCIES = 200
 _SLOWEST = 1e-4  # of the Nyquist frequency
 _ROUNDING = 1e-6  # of a pole: kp = 0 leaves one at 1
+_POSTURES, _SEED = 200, 0  # of an arm
 
 
 class Link(NamedTuple):
@@ -181,3 +185,35 @@ def limit_gains(horizon: float, disturbance: Array, braking: Array) -> tuple[Arr
     """
     flatter = 1.0 / (1.0 + 2.0 * disturbance / np.maximum(braking - disturbance, 1e-9))
     return 2.0 * flatter / horizon**2, (1.0 + flatter) / horizon
+
+
+class ArmInertia:
+    """Mass matrices of an arm at random postures within its position limits.
+
+    With M = D^(1/2) Q S^-1 Q' D^(1/2), D = diag(M), the torque M a_ref + lambda D s falls apart
+    into n loops of one joint each, which differ in the gain of the integral action only: lambda
+    times a number of S. The numbers 1 / S are at least 0 and n in the mean over 1: coupled joints
+    have some far above 1.
+
+    Args:
+        model: n joints with one coordinate each.
+        q_min: lower position limits, shape (n,), rad; perhaps infinite.
+        q_max: upper ones, shape (n,), rad.
+
+    Attributes:
+        matrices: M, shape (N, n, n), kg m^2.
+        factors: smallest and largest number of S anywhere.
+        diagonal: largest inertia of each joint, shape (n,), kg m^2.
+    """
+
+    def __init__(self, model: pin.Model, q_min: Array, q_max: Array) -> None:
+        low, high = np.maximum(q_min, -math.pi), np.minimum(q_max, math.pi)
+        data, random = model.createData(), np.random.default_rng(_SEED)
+        self.matrices = np.array(
+            [pin.crba(model, data, random.uniform(low, high)).copy() for _ in range(_POSTURES)]
+        )
+        diagonals = np.diagonal(self.matrices, axis1=1, axis2=2)
+        self.diagonal: Array = diagonals.max(axis=0)
+        scale = 1.0 / np.sqrt(diagonals)
+        shares = np.linalg.eigvalsh(self.matrices * scale[:, :, None] * scale[:, None, :])
+        self.factors = 1.0 / float(shares.max()), 1.0 / float(shares.min())
