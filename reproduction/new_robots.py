@@ -102,7 +102,8 @@ def play(name: str, arm: Arm) -> Row:
     (FOLDER / f"{name}.txt").write_text("\n".join(lines) + "\n")
     if not any(line.startswith("written: ") for line in lines):
         refusals = [line for line in lines if line.startswith("new_robot: ")]
-        why = "; ".join(line.removeprefix("new_robot: ") for line in refusals or lines[-1:])
+        whys = [line.removeprefix("new_robot: ") for line in refusals or lines[-1:]]
+        why = "; ".join(each.partition(";")[0] for each in whys)
         return (f"`{name}`", *[""] * (len(HEADS) - 3), why, "")
     values = yaml.safe_load((config / f"{name}.yaml").read_text())
     robot = values["/**"]["ros__parameters"]

@@ -119,16 +119,14 @@ def topics_page() -> str:
     text = f"""{_HEAD}
 # Topics, services, modes
 
-Names are relative, so that a second arm needs only a namespace. A robot of your own takes the
-place of `bullet_node`. The tables write nodes without `_node`. *User* stands for programs of
-yours; `scenario_node` and `viewer_node` count as such.
+Names are relative: a second arm needs only a namespace. A robot of your own takes the place of
+`bullet_node`. Nodes are written without `_node`. *User* stands for programs of yours.
 
 ## Control streams
 
-Published reliably, so that every tool hears them, and subscribed to with best effort; depth 1: the
-newest message wins. A reliable subscriber is work for the publisher: on slow networks take
-`slow/joint_states`. The stamp of a joint state names the control
-step; estimates, limits and commands carry the stamp of the state that they answer.
+Published reliably and subscribed to with best effort; depth 1: the newest message wins. On slow
+networks take `slow/joint_states`. The stamp of a joint state names the control step; estimates,
+limits and commands carry the stamp of the state that they answer.
 
 """
     heads = ("topic", "type", "from → to", "meaning")
@@ -181,8 +179,8 @@ def _modes() -> str:
 | POSITION | the robot's own drives hold the commanded position |
 | STOPPED | publishes nothing, so that the robot stops itself |
 
-The table lists what keeps the controller from serving its goals. Several causes may last at the
-same time; the first of them in the table gives the mode. Without any, the mode is TRACKING.
+The table lists what keeps the controller from serving its goals. Of several causes the first in
+the table gives the mode; without any, it is TRACKING. Where no reason is given, it is the event.
 *Share* is the part of the goals that the arm serves, 0 to 1; it rises to 1 within 0.5 s.
 `/diagnostics` has mode, reason and share.
 
@@ -194,7 +192,7 @@ same time; the first of them in the table gives the mode. Without any, the mode 
                 cause.event,
                 cause.ends,
                 cause.mode.value if cause.mode else "as without it",
-                cause.reason or "that of the event",
+                cause.reason,
                 cause.goals.value,
             )
             for cause in CAUSES.values()
