@@ -16,7 +16,8 @@ from sensor_msgs.msg import JointState
 
 from sim_bridge.node import viewer_node
 from sim_bridge.node.bullet_node import BulletNode
-from sim_bridge.node.viewer_node import PERIOD, PageCommands, ViewerNode
+from sim_bridge.node.page_commands import PageCommands
+from sim_bridge.node.viewer_node import PERIOD, ViewerNode
 from sim_bridge.viewer.page import DrivingAsked, GoalAsked, PushAsked
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode

@@ -19,15 +19,12 @@ import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
-from rclpy.node import Node
-from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
-from sim_bridge.node.topics import EXTERNAL_WRENCH
+from sim_bridge.node.page_commands import PageCommands
 from sim_bridge.viewer.joint_pictures import JointValues
-from sim_bridge.viewer.page import DrivingAsked, GoalAsked, Page, PushAsked, Request
+from sim_bridge.viewer.page import Page
 from sim_bridge.viewer.shapes import visual_shapes
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits
@@ -45,12 +42,7 @@ from viability_bounds_pkg.robot.gravity import TorqueConvention, gravity_beyond
 from viability_bounds_pkg.robot.locked_joints import LockedJoints
 from viability_bounds_pkg.robot.payload import Payload
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import (
-    Arrival,
-    JointStateReader,
-    pose_message,
-    wrench_message,
-)
+from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import node_parser, run_together
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf
@@ -103,64 +95,6 @@ class ViewerConfiguration(TaskFrames, LimitedRobotConfiguration):
         """Make the limits."""
         super().__post_init__()
         object.__setattr__(self, "limits", limits_of(self))
-
-
-class PageCommands:
-    """Publishes goals and pushes from the page; its publishers exist only while the user drives.
-
-    So another node may send goals before and after: the controller holds the arm where two do.
-
-    Args:
-        node: publishes.
-        base_frame: of goals.
-
-    Attributes:
-        robot_paused: whether there is a simulated robot that is paused.
-    """
-
-    def __init__(self, node: Node, base_frame: str) -> None:
-        self._node, self._base_frame = node, base_frame
-        self._poses: Publisher | None = None
-        self._wrenches: Publisher | None = None
-        self._pushed: set[str] = set()
-        self.robot_paused = self._resumed = False
-        self._pause = node.create_client(SetBool, "bullet_node/pause")
-
-    def start(self) -> None:
-        """Create the publishers; resume a simulated robot that is paused."""
-        if self._poses is None:
-            self._poses = self._node.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
-            self._wrenches = EXTERNAL_WRENCH.publisher(self._node)
-        if self.robot_paused and not self._resumed and self._pause.service_is_ready():
-            self._resumed = True
-            self._pause.call_async(SetBool.Request(data=False))
-
-    def stop(self) -> None:
-        """End the pushes, destroy the publishers, and pause the robot if it was paused before."""
-        for link in list(self._pushed):
-            self._push(link, np.zeros(3))
-        for each in (self._poses, self._wrenches):
-            if each is not None:
-                self._node.destroy_publisher(each)
-        self._poses = self._wrenches = None
-        if self._resumed:
-            self._resumed = False
-            self._pause.call_async(SetBool.Request(data=True))
-
-    def send(self, request: Request) -> None:
-        """Do what was asked for; goals and pushes only while driving."""
-        if isinstance(request, DrivingAsked):
-            (self.start if request.drive else self.stop)()
-        elif isinstance(request, GoalAsked) and self._poses is not None:
-            self._poses.publish(pose_message(request.pose, self._base_frame))
-        elif isinstance(request, PushAsked):
-            self._push(request.link, request.force)
-
-    def _push(self, link: str, force: Array) -> None:
-        if self._wrenches is None:
-            return
-        self._wrenches.publish(wrench_message(link, force))
-        (self._pushed.add if force.any() else self._pushed.discard)(link)
 
 
 class ViewerNode(ArmNode):
