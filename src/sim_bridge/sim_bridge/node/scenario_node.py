@@ -12,12 +12,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.task import Future
 
 from sim_bridge.mcap_file import McapFile
+from sim_bridge.node.progress import Progress
 from sim_bridge.node.run_recorder import RunRecorder
 from sim_bridge.node.scenario_messages import (
     RESET,
@@ -31,12 +31,10 @@ from sim_bridge.node.scenario_messages import (
     to_service,
 )
 from sim_bridge.scenario.events import ServiceEvent
-from sim_bridge.scenario.progress import Progress
 from sim_bridge.scenario.report import RecordedRun, write_report
 from sim_bridge.scenario.scenario import ScenarioConfiguration
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.robot.configuration import units_of
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import (
@@ -62,9 +60,9 @@ class ScenarioNode(ArmNode):
     """Resets a paused robot, plays a scenario on it, and records the run.
 
     A robot whose diagnostics tell nothing of pauses is neither reset nor paused. Goals, pushes and
-    obstacles are sent before their time with the stamps at which they
-    take effect. In lockstep the robot is paused where a service must be called, until it has
-    answered; so a run in lockstep is the same each time.
+    obstacles are sent before their time with the stamps at which they take effect. In lockstep the
+    robot is paused where a service must be called, until it has answered; so a run in lockstep is
+    the same each time.
 
     Args:
         file: to which all messages go as they come; None for none.
@@ -84,7 +82,6 @@ class ScenarioNode(ArmNode):
         with self.starting():
             config = NodeParameters(self, ScenarioConfiguration).configuration
         self.config = config
-        self._units = units_of(config.urdf, config.joints)
         self.awaits = ""
         self.ended: Future[None] = Future()
         self.failure: ScenarioRefused | None = None
@@ -156,10 +153,7 @@ class ScenarioNode(ArmNode):
         while not self.recorder.answered == self.recorder.stamp > before:
             yield "resetting: there is no joint command for the start"
         # Resuming begins a new period: the first state in motion is the next.
-        self._period = round(1e9 * float(self.robot["period_s"]))
-        self._first = self.recorder.stamp + self._period
-        self._refused = {}
-        self._check_refusals(self._refused)  # those before the first message do not count
+        self._begin(1)
         while not self._load():
             yield "loading: there is no report that the messages of the scenario were received"
         lockstep = self.robot["clock"] == "lockstep"
@@ -180,17 +174,21 @@ class ScenarioNode(ArmNode):
 
     def _play_through(self) -> Iterator[str]:
         """Play on a robot that goes on by itself; its messages are sent before the first goal."""
-        self._period = round(1e9 * float(self.robot["period_s"]))
-        lead = round(1e9 * _LEAD / self._period)
-        self._first = self.recorder.stamp + lead * self._period
-        self._refused = {}
-        self._check_refusals(self._refused)
+        lead = round(_LEAD / float(self.robot["period_s"]))
+        self._begin(lead)
         loaded, now = False, -lead
         while now < self._duration:
             loaded = loaded or self._load()
             yield from self._call_services(now)
             yield "playing"
             now = (self.recorder.stamp - self._first) // self._period
+
+    def _begin(self, lead: int) -> None:
+        """Let the scenario start `lead` periods from now; refusals of before do not count."""
+        self._period = round(1e9 * float(self.robot["period_s"]))
+        self._first = self.recorder.stamp + lead * self._period
+        self._refused = {}
+        self._check_refusals(self._refused)
 
     def _stop(self) -> Iterator[str]:
         """Pause the robot if the scenario has begun and it can, and end."""
@@ -267,23 +265,9 @@ class ScenarioNode(ArmNode):
         if self._refused is None:
             progress.wait(self.awaits)
             return
-        distance = np.minimum(
-            self.recorder.q - self.config.position_min, self.config.position_max - self.recorder.q
-        )
-        nearest = int(np.argmin(distance))
-        controller = self.recorder.diagnostics["controller_node"]
-        state = (
-            f"{controller.get('mode', '')}  "
-            f"nearest limit {self.config.joints[nearest]} {distance[nearest]:+.4f} "
-            f"{self._units[nearest]}"
-        )
-        error = float(controller.get("position_error_m", "nan"))
-        if np.isfinite(error):  # there is a goal
-            state += f"  pose error {1e3 * error:.2f} mm"
-        state += f"  {float(self.robot['rate_hz']):.0f} Hz"
         # With the period that the last state begins.
         played = 1e-9 * (self.recorder.stamp - self._first + self._period)
-        progress.show(max(0.0, played), state)
+        progress.show(max(0.0, played))
 
 
 def play(
@@ -324,7 +308,7 @@ def play(
 def _run(executor: Executor, node: ScenarioNode, signals: Sequence[int], quiet: bool) -> None:
     """Run callbacks until the scenario has ended, one is to end it, or nothing moves any more."""
     seen, moved_at, shown_at = None, time.monotonic(), -math.inf
-    progress = None if quiet else Progress(node.config.plan.duration)
+    progress = None if quiet else Progress(node.config, node.recorder)
     while not (node.ended.done() or signals) and rclpy.ok(context=node.context):
         # Many callbacks in a call: a tenth of the time of a period in lockstep would go into
         # calls for one each.
