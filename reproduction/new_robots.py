@@ -18,7 +18,6 @@ FOLDER = RESULTS / "new_robot"
 HEADS = (
     "arm",
     "joints",
-    "without end",
     "rate, Hz",
     "speeds, of the URDF's",
     "acceleration limits, rad/s²",
@@ -115,7 +114,6 @@ def play(name: str, arm: Arm) -> Row:
     return (
         f"`{name}`",
         str(len(robot["joints"])),
-        str(sum(" turns without end" in line for line in lines) or "-"),
         f"{robot['rate_hz']:g}",
         *(slower or ["1"])[:1],
         f"{low:g} to {max(robot['acceleration_max']):g}",
