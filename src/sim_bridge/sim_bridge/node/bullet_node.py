@@ -26,8 +26,8 @@ from sim_bridge.hardware import Sensing
 from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot, make_stop
 from sim_bridge.node.topics import CLOCK, PAUSE, RECORDED, RESET
 from sim_bridge.node.world_subscriber import WorldSubscriber
+from sim_bridge.pace import Pace
 from viability_bounds_pkg.plausible import RESTART_GAP
-from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.robot.gravity import gravity_beyond
 from viability_bounds_pkg.ros.arm_node import ArmNode
@@ -52,12 +52,6 @@ RETRY_PERIOD = 0.03
 
 AHEAD = 20
 """Periods that a robot in lockstep goes on without its recorder; a socket's buffer keeps more."""
-
-SLOW_AFTER = 2.0
-"""How long the robot runs until the rate that the machine keeps is known, s."""
-
-SLOW = 0.95
-"""Share of the control rate below which the machine is too slow."""
 
 _CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
 
@@ -114,7 +108,7 @@ class BulletNode(ArmNode):
         )
         self._ft_wrench = WrenchStamped()
         self._ft_publisher = self.stream(FT_WRENCH) if self._robot.sensor else None
-        self._compared = False
+        self._pace = Pace(config.rate_hz)
         self._sensing = Sensing(config.imperfections, config.torque_max, config.dt)
         model = load_model(config, config.urdf)
         self._gravity = gravity_beyond(model, config.command_includes_gravity)
@@ -168,18 +162,15 @@ class BulletNode(ArmNode):
         self._monitor.reset()
         self._commands.restart()
         self._braked = 0
-        self._periods = 0
+        self._pace.restart()
         self._plan_pause()
         self._refused.clear()
-        self._period_errors = RecentValues()
-        self._ticked_at, self._late = math.nan, 0
-        self._started_at, self._played = time.monotonic(), 0
         self._recorded: float = math.inf  # stamp, ns; no recorder has told one yet
 
     def _plan_pause(self) -> None:
         """Compute the period at which to pause, `pause_after` from now."""
         periods = round(self._node_parameters.configuration.pause_after / self._config.dt)
-        self._pause_at: float = self._periods + periods if periods else math.inf
+        self._pause_at: float = self._pace.periods + periods if periods else math.inf
 
     @property
     def true_positions(self) -> NDArray[np.float64]:
@@ -229,7 +220,7 @@ class BulletNode(ArmNode):
             self._robot.brake(config.substeps, config.torque_max)
         elif command is None:
             # No command can have arrived before the first one's delay.
-            self._braked += self._periods >= config.imperfections.command_delay
+            self._braked += self._pace.periods >= config.imperfections.command_delay
             if self._stop is not None and commands.commanded:
                 self._robot.stop(self._stop, config.substeps)
             else:
@@ -245,10 +236,10 @@ class BulletNode(ArmNode):
         else:
             self._robot.move(*command, config.torque_max, config.velocity_max, config.substeps)
         self._reading = self._sensing.read(*self._true_state())
-        self._periods += 1
+        self._pace.periods += 1
         self._has_moved = True
         self._advanced = True
-        if self._periods >= self._pause_at:
+        if self._pace.periods >= self._pause_at:
             self._pause_at = math.inf
             self._pause()
 
@@ -263,14 +254,9 @@ class BulletNode(ArmNode):
 
     def _tick(self) -> None:
         """End a period in real time and begin the next."""
-        last, self._ticked_at = self._ticked_at, math.nan if self._paused else time.monotonic()
+        self._pace.tick(self._paused)
         if self._paused:
             return
-        if math.isfinite(last):
-            dt, took = self._config.dt, self._ticked_at - last
-            self._period_errors.add(abs(took - dt))
-            # A real robot would have gone on.
-            self._late += max(0, round(took / dt) - 1)
         if not self._advanced:
             self._advance()
         self._next_state()
@@ -330,7 +316,7 @@ class BulletNode(ArmNode):
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if self._paused and not request.data:
             self._paused = False
-            self._started_at, self._played = time.monotonic(), self._periods
+            self._pace.resume()
             self._plan_pause()
             # A new stamp: commands that answer what was sent during the pause are for old goals,
             # also those still on their way. In real time it comes with the next tick, so that
@@ -357,20 +343,16 @@ class BulletNode(ArmNode):
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
         monitor, commands = self._monitor, self._commands
-        latencies, errors = commands.latencies, self._period_errors
-        elapsed = time.monotonic() - self._started_at
-        obstacles, control = self._robot.obstacles, self._control()
+        latencies, obstacles, control = commands.latencies, self._robot.obstacles, self._control()
         values = {
             "clock": "lockstep" if self._config.lockstep else "real_time",
             "paused": self._paused,
             "control": control,
             "stamp_ns": self._stamp,
             "period_s": self._config.dt,
-            "periods": self._periods,
-            "rate_hz": (self._periods - self._played) / elapsed,
+            **self._pace.values(),
             "physics_steps_per_period": self._config.substeps,
             "deadline_misses": commands.missed,
-            "late_periods": self._late,
             "missed_deadlines_injected": commands.path.missed,
             "imperfections": ", ".join(self._config.imperfections.names) or "none",
             "braked_periods": self._braked,
@@ -380,9 +362,6 @@ class BulletNode(ArmNode):
             "contact_force_max_n": obstacles.force_max,
             "latency_p50_us": 1e6 * latencies.percentile(50),
             "latency_p99_us": 1e6 * latencies.percentile(99),
-            "period_error_p50_us": 1e6 * errors.percentile(50),
-            "period_error_p99_us": 1e6 * errors.percentile(99),
-            "period_error_max_us": 1e6 * errors.largest,
             "commanded_torque_ratio_max": commands.torque_ratio,
             "position_violation_rad": monitor.max_position_violation,
             "velocity_violation_rad_s": monitor.max_velocity_violation,
@@ -390,8 +369,8 @@ class BulletNode(ArmNode):
             "lower_clearance_rad": monitor.closest_to_q_min,
             "upper_clearance_rad": monitor.closest_to_q_max,
         }
-        if not self._compared and (self._periods + self._late) * self._config.dt > SLOW_AFTER:
-            self._compare_rate()
+        if too_slow := self._pace.too_slow():
+            self.get_logger().warning(too_slow)
         if monitor.violated:
             return DiagnosticStatus.ERROR, "a limit was broken", values
         if self._paused:
@@ -402,16 +381,6 @@ class BulletNode(ArmNode):
             doing = "braking" if control == "brakes" else control
             return DiagnosticStatus.WARN, f"{doing}: no commands", values
         return DiagnosticStatus.OK, "running", values
-
-    def _compare_rate(self) -> None:
-        """Tell, once after the start, where the machine simulates fewer periods than it should."""
-        self._compared = True
-        rate, share = self._config.rate_hz, self._periods / (self._periods + self._late)
-        if share < SLOW:
-            self.get_logger().warning(
-                f"the simulation keeps {share * rate:.0f} of {rate:g} Hz here: set rate_hz of all "
-                "nodes to less than that, or clock to lockstep"
-            )
 
     def destroy_node(self) -> None:
         """Disconnect from the physics engine too."""
