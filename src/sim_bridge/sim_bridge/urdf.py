@@ -32,10 +32,10 @@ from numpy.typing import NDArray
 
 from viability_bounds_pkg.robot.description import build_model, kinematic_order, unknown_name
 from viability_bounds_pkg.robot.files import RobotDescriptionError, resolve_uri
+from viability_bounds_pkg.robot.mistakes import MOVING, end_of
 
 Array = NDArray[np.float64]
 
-_MOVABLE = ("revolute", "continuous", "prismatic")
 # PyBullet makes no stop where lower > upper.
 _NO_STOP = {"lower": "1", "upper": "-1", "effort": "0", "velocity": "0"}
 # The caller sets the moments of inertia after loading.
@@ -111,12 +111,12 @@ def prepare_urdf(
     others = {
         joint.get("name", ""): locked.get(joint.get("name", ""), 0.0)
         for joint in root.findall("joint")
-        if joint.get("type") in _MOVABLE and joint.get("name") not in joints
+        if joint.get("type") in MOVING and joint.get("name") not in joints
     }
     arm = _reduced_arm(root, joints, locked, sensor_frame, mass_scales or {})
     output = Element("robot", name=root.get("name", "robot"))
     output.extend(deepcopy(root.findall("material")))
-    children = {joint.get("name", ""): _link_at(joint, "child") for joint in root.findall("joint")}
+    children = {joint.get("name", ""): end_of(joint, "child") for joint in root.findall("joint")}
     links = {link.get("name", ""): link for link in root.findall("link")}
     base = next(name for name in links if name not in children.values())
     frames, inertias = {}, {}
@@ -284,12 +284,6 @@ def _read_numbers(element: Element | None, name: str, count: int) -> Array:
     return numbers
 
 
-def _link_at(joint: Element, end: str) -> str:
-    """Return the name of the link at the "parent" or "child" `end` of a joint; may be empty."""
-    element = joint.find(end)
-    return "" if element is None else element.get("link", "")
-
-
 def _joints_on(root: Element, link: str) -> list[Element]:
     """Return the joints of the URDF `root` that carry what is mounted on `link`.
 
@@ -299,7 +293,7 @@ def _joints_on(root: Element, link: str) -> list[Element]:
     known = [element.get("name", "") for element in root.findall("link")]
     if link not in known:
         raise unknown_name("link", link, known)
-    joints = [joint for joint in root.findall("joint") if _link_at(joint, "parent") == link]
+    joints = [joint for joint in root.findall("joint") if end_of(joint, "parent") == link]
     if not joints:
         raise RobotDescriptionError(f"link {link!r} carries no other link to measure")
     return joints

@@ -22,7 +22,7 @@ from sim_bridge.mcap_file import McapFile
 from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES, RECORDED
 from sim_bridge.scenario.report import Array, RecordedRun
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Arrival, JointOrder, JointStateReader
+from viability_bounds_pkg.ros.messages import Arrival, JointOrder, JointStateReader, wrench_numbers
 from viability_bounds_pkg.ros.runtime import LATCHED_QOS, stamp_to_ns
 from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
@@ -107,7 +107,7 @@ class RunRecorder:
         self._order_of_limits, self._order_of_commands = JointOrder(joints), JointOrder(joints)
         self._limits: dict[int, list[Array]] = {}
         self._torques: dict[int, Array] = {}
-        self._wrenches: dict[int, Sequence[float]] = {}
+        self._wrenches: dict[int, Array] = {}
         self._recorded = RECORDED.publisher(node)
         for topic, callback in (
             (JOINT_STATES, self._on_state),
@@ -173,7 +173,7 @@ class RunRecorder:
             a_lower=limits[:, 0],
             a_upper=limits[:, 1],
             tau=np.array([self._torques.get(s, nan) for s in stamps]),
-            ft_wrench=np.array([self._wrenches.get(s, [np.nan] * 6) for s in stamps]),
+            ft_wrench=np.array([self._wrenches.get(s, np.full(6, np.nan)) for s in stamps]),
             answered=np.array([s in self._torques for s in stamps]),
         )
 
@@ -200,8 +200,7 @@ class RunRecorder:
         self._torques.setdefault(self.answered, found[0] if found else unknown)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
-        f, t = message.wrench.force, message.wrench.torque
-        self._wrenches[stamp_to_ns(message.header.stamp)] = f.x, f.y, f.z, t.x, t.y, t.z
+        self._wrenches[stamp_to_ns(message.header.stamp)] = wrench_numbers(message)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
@@ -18,6 +18,7 @@ from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES
 from viability_bounds_pkg.robot.files import RobotDescriptionError
+from viability_bounds_pkg.ros.messages import wrench_numbers
 from viability_bounds_pkg.ros.refusals import RefusalLog, stamp_fault
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
@@ -118,15 +119,13 @@ class WorldSubscriber:
         self._pending.sort(key=lambda pending: pending.stamp)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
-        link = message.header.frame_id
-        f, t = message.wrench.force, message.wrench.torque
-        force, torque = (f.x, f.y, f.z), (t.x, t.y, t.z)
+        link, wrench = message.header.frame_id, wrench_numbers(message)
         try:
             self._robot.link_pose(link)  # or it raises
-            if not all(map(math.isfinite, force + torque)):
+            if not np.isfinite(wrench).all():
                 raise ValueError("it is not finite")
             stamp = stamp_to_ns(message.header.stamp)
-            apply = partial(self._robot.apply_wrench, link, force, torque)
+            apply = partial(self._robot.apply_wrench, link, *np.split(wrench, 2))
             self._add(_Change(stamp, "external_wrench", link, apply))
         except _REFUSED as error:
             self._refuse("external_wrench", error)

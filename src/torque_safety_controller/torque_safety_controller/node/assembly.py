@@ -29,10 +29,10 @@ from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.step import Part
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError, did_you_mean
-from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_parameters import (
     Bounds,
     BoundsConfiguration,
+    limits_of,
     make_bounds,
 )
 from viability_bounds_pkg.robot.configuration import load_model
@@ -196,17 +196,7 @@ def _own_bounds(
     n = len(config.joints)
     if not (len(low) == len(high) == n and np.isfinite(config.velocity_max).all()):
         return None
-    limits = JointLimits(
-        config.joints,
-        config.position_min,
-        config.position_max,
-        config.velocity_max,
-        low,
-        high,
-        config.velocity_offset,
-        config.deceleration_limit,
-    )
-    margin = MARGIN * np.minimum(-low, high)
+    limits, margin = limits_of(config, 0.0, config.collision), MARGIN * np.minimum(-low, high)
     return BoundsSolver(limits, HORIZON * config.dt, margin, period=config.dt).bounds
 
 

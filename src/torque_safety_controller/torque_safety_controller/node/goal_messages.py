@@ -27,7 +27,9 @@ from viability_bounds_pkg.pose_trajectory import (
     TrajectoryPoint,
 )
 from viability_bounds_pkg.robot.configuration import RobotConfiguration
+from viability_bounds_pkg.ros.messages import numbers_of
 from viability_bounds_pkg.ros.refusals import stamp_fault
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 Array = NDArray[np.float64]
 
@@ -51,11 +53,6 @@ def check_stamp(stamp: int, now: int, ahead_max: float, late_max: float = math.i
     """Refuse a stamp that is far from the robot's time; see `stamp_fault`."""
     if fault := stamp_fault(stamp, now, ahead_max, late_max):
         raise GoalRefused(fault)
-
-
-def numbers_of(*vectors: Vector3) -> Array:
-    """Return the numbers of one or more vectors, shape (3,) or (6,)."""
-    return np.array([value for each in vectors for value in (each.x, each.y, each.z)])
 
 
 def pose_from_message(message: PoseStamped, base_frame: str) -> pin.SE3:
@@ -114,7 +111,7 @@ def trajectory_from_message(
             raise GoalRefused(f"points[{k}] asks for {fast:g}; allowed: up to {_FASTEST:g}")
         transform = point.transforms[0]
         pose = base * _placement(transform.translation, transform.rotation)
-        time = point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec
+        time = 1e-9 * stamp_to_ns(point.time_from_start)
         points.append(TrajectoryPoint(time, pose, *rates))
     try:
         return PoseTrajectory(points)
@@ -185,7 +182,7 @@ def joint_trajectory_from_message(
         q, v, a = parts
         assert q is not None
         _check_positions(q, config, f"points[{k}]: ")
-        time = point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec
+        time = 1e-9 * stamp_to_ns(point.time_from_start)
         points.append(JointPoint(time, q, v, a))
     try:
         return JointTrajectory(points)

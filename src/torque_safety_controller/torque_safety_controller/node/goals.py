@@ -24,7 +24,6 @@ from torque_safety_controller.node.goal_messages import (
     check_frame,
     check_stamp,
     joint_trajectory_from_message,
-    numbers_of,
     pose_from_message,
     posture_from_message,
     trajectory_from_message,
@@ -43,6 +42,7 @@ from torque_safety_controller.node.topics import (
 from torque_safety_controller.node.waiting_goals import WaitingGoals
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.messages import numbers_of
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import Topic
 from viability_bounds_pkg.state import State, whole_turns

@@ -13,7 +13,7 @@ from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from std_srvs.srv import Trigger
 
-from torque_safety_controller.node.goal_messages import GoalRefused, check_frame, numbers_of
+from torque_safety_controller.node.goal_messages import GoalRefused, check_frame
 from torque_safety_controller.node.topics import TARE_FT_SENSOR, TARGET_WRENCH
 from torque_safety_controller.node.waiting_goals import WaitingGoals
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
@@ -24,6 +24,7 @@ from torque_safety_controller.parts.contact.wrench_sensor import (
     WrenchSensor,
 )
 from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.messages import wrench_numbers
 from viability_bounds_pkg.ros.runtime import stamp_to_ns, steady_timer
 from viability_bounds_pkg.ros.topics import FT_WRENCH
 
@@ -79,7 +80,7 @@ class WrenchSubscriber:
         self._measured_at = stamp
         try:
             check_frame(message.header.frame_id, self._config.interaction.ft_frame)
-            sensor.receive(_wrench(message))
+            sensor.receive(wrench_numbers(message))
         except GoalRefused as error:
             # Counted together, whatever the frame: senders do not make the report longer.
             self._refuse("another frame_id", str(error))
@@ -95,7 +96,7 @@ class WrenchSubscriber:
         config, interaction = self._config, self._interaction
         if interaction is None:
             raise GoalRefused("there is no force/torque sensor, 'ft_frame'")
-        wrench = _wrench(message)
+        wrench = wrench_numbers(message)
         if not np.isfinite(wrench).all():
             raise GoalRefused("wrench is not finite")
         if (strong := np.abs(wrench).max()) > STRONGEST:
@@ -148,8 +149,3 @@ class WrenchSubscriber:
             self._logger.warning(text)
         else:
             self._logger.info(text)
-
-
-def _wrench(message: WrenchStamped) -> Array:
-    """Return the numbers of a message, shape (6,), N and N m."""
-    return numbers_of(message.wrench.force, message.wrench.torque)

@@ -24,7 +24,13 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from torque_safety_controller.node.topics import HAND_POSE, TARGET_JOINT_TRAJECTORY, TARGET_POSE
 from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
-from viability_bounds_pkg.ros.messages import Arrival, JointStateReader, pose_message
+from viability_bounds_pkg.ros.messages import (
+    Arrival,
+    JointStateReader,
+    numbers_of,
+    pose_message,
+    wrench_message,
+)
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, is_subscribed, make_executor, set_stamp
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, JOINT_STATES, LIMIT_DISTANCES, Topic
 from viability_bounds_pkg.state import whole_turns
@@ -245,16 +251,12 @@ class ArmClient:
             link: its name.
             force: shape (3,); zeros end the push.
         """
-        message = WrenchStamped()
-        message.header.frame_id = link
-        part = message.wrench.force
-        part.x, part.y, part.z = map(float, force)
         self._wait(
             lambda: is_subscribed(self._node, "external_wrench", "bullet_node"),
             self._timeout,
             "no simulated robot is heard",
         )
-        self._pushes.publish(message)
+        self._pushes.publish(wrench_message(link, force))
 
     @contextmanager
     def record(self) -> Iterator[StateRecording]:
@@ -320,7 +322,6 @@ class ArmClient:
 
     def _hand(self) -> pin.SE3:
         pose = self._heard[HAND_POSE.name].pose
-        p, o = pose.position, pose.orientation
-        return pin.SE3(
-            pin.Quaternion(o.w, o.x, o.y, o.z).toRotationMatrix(), np.array([p.x, p.y, p.z])
-        )
+        o = pose.orientation
+        turn = pin.Quaternion(o.w, o.x, o.y, o.z).toRotationMatrix()
+        return pin.SE3(turn, numbers_of(pose.position))

@@ -56,18 +56,24 @@ BASELINES = {
 METHODS = ("exact", *BASELINES)
 
 
-def limits_of(config: Any, clearance: Array | float = 0.0) -> JointLimits:
+def limits_of(
+    config: Any, clearance: Array | float = 0.0, accelerations: Any = None
+) -> JointLimits:
     """Return the limits in a configuration that has these fields of `BoundsConfiguration`.
 
-    `clearance`: distance to keep from the position limits, shape (n,), rad.
+    Args:
+        config: the configuration.
+        clearance: distance to keep from the position limits, shape (n,), rad.
+        accelerations: what has the limits of accelerations; None for `config`.
     """
+    accelerations = accelerations or config
     return JointLimits(
         config.joints,
         config.position_min + clearance,
         config.position_max - clearance,
         config.velocity_max,
-        config.acceleration_min,
-        config.acceleration_max,
+        accelerations.acceleration_min,
+        accelerations.acceleration_max,
         config.velocity_offset,
         config.deceleration_limit,
     )

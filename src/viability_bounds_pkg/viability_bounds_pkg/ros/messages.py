@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import Point, PoseStamped, Vector3, WrenchStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
@@ -305,6 +305,16 @@ class CommandReader:
             reason = "not finite"
         count_refusal("joint_commands", reason, detail, self._refused, self._warn)
         return None
+
+
+def numbers_of(*vectors: Point | Vector3) -> Array:
+    """Return the numbers of one or more vectors, shape (3,) or (6,)."""
+    return np.array([value for each in vectors for value in (each.x, each.y, each.z)])
+
+
+def wrench_numbers(message: WrenchStamped) -> Array:
+    """Return the numbers of a wrench, shape (6,), N and N m."""
+    return numbers_of(message.wrench.force, message.wrench.torque)
 
 
 def pose_message(pose: pin.SE3, frame: str = "", stamp: int = 0) -> PoseStamped:
