@@ -41,12 +41,12 @@ from __future__ import annotations
 
 import math
 
-import daqp
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError, joint_array
+from viability_bounds_pkg.robot.dynamics import Dynamics, within_torque_limits
 from viability_bounds_pkg.viability import BoundsSolver
 
 Array = NDArray[np.float64]
@@ -92,12 +92,6 @@ PASS_TIME = 0.05
 RETURN_TIME = 0.1
 """In which commands that return after a stop get back all of their effect, s."""
 
-STIFFNESS = 1000.0
-"""How much a departure from the interval counts beside one from the wanted acceleration."""
-
-_UNLIMITED = 1e30
-"""Infinity of DAQP."""
-
 
 class CoordinatedStop:
     """A law for the drives of an arm that brings it to rest and holds it, without commands.
@@ -139,32 +133,26 @@ class CoordinatedStop:
         motor_lag: ArrayLike | None = None,
         torque_step: ArrayLike | None = None,
     ) -> None:
-        names = list(model.names)[1:]
-        if sorted(names) != sorted(limits.names) or model.nv != len(names):
-            allowed = f"must be the joints of the model: {', '.join(names)}"
-            raise JointLimitsError("names", None, list(limits.names), allowed)
+        self._dynamics = Dynamics(model, limits.names)
+        n = len(limits)
         torques = joint_array("tau_max", tau_max, limits.names)
         for name, value in zip(limits.names, torques.tolist(), strict=True):
             if not (math.isfinite(value) and value > 0.0):
                 raise JointLimitsError("tau_max", name, value, "must be finite and positive")
-        given = np.zeros(len(names)) if motor_lag is None else motor_lag
+        given = np.zeros(n) if motor_lag is None else motor_lag
         lag = joint_array("motor_lag", given, limits.names)
         margin = MARGIN * np.minimum(-limits.a_min, limits.a_max)
         self._solver = BoundsSolver(limits, HORIZON * dt, margin, period=dt)
         self._limits, self._dt, self._tau_max = limits, dt, torques
-        # Where the joints of the model are in the caller's arrays, and the other way round.
-        self._order = np.array([limits.names.index(name) for name in names])
-        self._back = np.argsort(self._order)
-        self._model, self._data = model, model.createData()
         self._share = 0.0 if math.isinf(observer_time) else -math.expm1(-dt / observer_time)
         self._scale = 0.5 * (limits.a_max - limits.a_min)
         self._lag = lag if lag.any() else None
-        given = np.full(len(names), np.inf) if torque_step is None else torque_step
+        given = np.full(n, np.inf) if torque_step is None else torque_step
         self._step = joint_array("torque_step", given, limits.names)
         self._soonest = dt if np.isinf(self._step).all() else max(dt, SOFT_REST)
         clear = np.minimum(HOLD_CLEARANCE, 0.5 * (limits.q_max - limits.q_min))
         self._lowest, self._highest = limits.q_min + clear, limits.q_max - clear
-        self.start(np.zeros(len(names)), np.zeros(len(names)))
+        self.start(np.zeros(n), np.zeros(n))
 
     def start(
         self,
@@ -188,7 +176,7 @@ class CoordinatedStop:
         self._disturbance = np.zeros(n)
         self._expected = v.copy()
         if self._share and motor_torque is not None and acceleration is not None:
-            besides = self._inverse_dynamics(q, v, acceleration) - motor_torque
+            besides = self._dynamics.torque(q, v, acceleration) - motor_torque
             self._disturbance = np.clip(besides, -self._tau_max, self._tau_max)
         known = None if np.isinf(self._step).all() else motor_torque
         self._last = known  # torques of the last step, where they matter
@@ -230,11 +218,11 @@ class CoordinatedStop:
     ) -> Array:
         lead = v
         if self._lag is not None and motor_torque is not None:
-            lead = v + self._lag * self._forward_dynamics(q, v, motor_torque)
+            lead = v + self._lag * self._dynamics.acceleration(q, v, motor_torque)
         if self._share:
             self._observe(q, lead)
         if self._lag is not None and motor_torque is not None:
-            a = self._forward_dynamics(q, v, motor_torque + self._disturbance)
+            a = self._dynamics.acceleration(q, v, motor_torque + self._disturbance)
             q, v = q + self._lag * v, v + self._lag * a
         h = self._dt
         lower, upper, viable = self._solver.bounds(q, v)
@@ -249,16 +237,16 @@ class CoordinatedStop:
         passed = bool((np.abs(a - wanted) <= MARGIN * self._scale).all())
         self._passed_for = self._passed_for + h if passed and command is not None else 0.0
         middle = q + 0.5 * h * v + 0.125 * h * h * a, v + 0.5 * h * a
-        tau = self._inverse_dynamics(*middle, a) - self._disturbance
+        tau = self._dynamics.torque(*middle, a) - self._disturbance
         low, high = self._torque_range()
         feasible = bool(((tau >= low) & (tau <= high)).all())
         if self._share or not feasible:
-            self._M = M = self._mass_matrix(middle[0])
+            self._M = M = self._dynamics.mass_matrix(middle[0])
             if not feasible:
                 nearest = self._nearest(tau, a, lower, upper, M, (low, high))
                 tau = np.clip(tau + M @ (nearest - a), low, high)
                 middle = q + 0.5 * h * v + 0.125 * h * h * nearest, v + 0.5 * h * nearest
-                a = self._forward_dynamics(*middle, tau + self._disturbance)
+                a = self._dynamics.acceleration(*middle, tau + self._disturbance)
         self.acceleration = a
         self._expected = lead + h * a
         if self._last is not None:
@@ -333,7 +321,7 @@ class CoordinatedStop:
 
     def _commanded(self, q: Array, v: Array, command: Array) -> Array:
         """Return the accelerations that a command gives; after a stop less of the difference."""
-        a = self._forward_dynamics(q, v, command + self._disturbance)
+        a = self._dynamics.acceleration(q, v, command + self._disturbance)
         if self._resting:
             self._difference, self._share_left = self.acceleration - a, 1.0
         self._resting = self.at_rest = False
@@ -365,69 +353,3 @@ class CoordinatedStop:
         lower = np.where(lower <= self._limits.a_min, -np.inf, lower)
         upper = np.where(upper >= self._limits.a_max, np.inf, upper)
         return within_torque_limits(a, lower, upper, self._scale, M, tau, *torques)
-
-    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        order = self._order
-        tau: Array = pin.rnea(self._model, self._data, q[order], v[order], a[order])
-        return tau[self._back]
-
-    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
-        order = self._order
-        a: Array = pin.aba(self._model, self._data, q[order], v[order], tau[order])
-        return a[self._back]
-
-    def _mass_matrix(self, q: Array) -> Array:
-        """Return the symmetric mass matrix, shape (n, n), in the caller's order."""
-        M: Array = pin.crba(self._model, self._data, q[self._order])
-        return M[np.ix_(self._back, self._back)]
-
-
-def within_torque_limits(
-    a: Array,
-    lower: Array,
-    upper: Array,
-    scale: Array,
-    M: Array,
-    tau: Array,
-    tau_min: Array,
-    tau_max: Array,
-) -> Array:
-    """Return the accelerations nearest to `a` whose torques are within the limits.
-
-    A quadratic program, solved by DAQP [Arnstrom2022],
-
-        min  sum(x_i^2) + STIFFNESS sum(departure_i^2),   tau_min <= tau + M S x <= tau_max,
-
-    with accelerations ``a + S x``, S the diagonal matrix of `scale`, and the departure of an
-    acceleration from [lower, upper], in units of its scale. The torque limits are hard, the
-    intervals give way where both cannot be.
-
-    Args:
-        a: accelerations wanted, within the intervals, shape (n,), rad/s^2.
-        lower: lower ends of the intervals, shape (n,), rad/s^2.
-        upper: upper ends, shape (n,), rad/s^2.
-        scale: unit of each acceleration, shape (n,), rad/s^2.
-        M: mass matrix, shape (n, n), kg m^2.
-        tau: torques for `a`, shape (n,), N m.
-        tau_min: least torques, shape (n,), N m.
-        tau_max: greatest torques, shape (n,), N m.
-
-    Returns:
-        Shape (n,), rad/s^2; `a` itself where DAQP finds nothing, as for numbers that are not
-        finite.
-    """
-    n = a.size
-    one, none = np.eye(n), np.zeros((n, n))
-    unit = 0.5 * (tau_max - tau_min)
-    rows = np.block([[one, -one], [M * (scale / unit[:, np.newaxis]), none]])
-    high = np.concatenate([(upper - a) / scale, (tau_max - tau) / unit])
-    low = np.concatenate([(lower - a) / scale, (tau_min - tau) / unit])
-    x, _, flag, _ = daqp.solve(
-        np.diag(np.repeat([1.0, STIFFNESS], n)),
-        np.zeros(2 * n),
-        rows,
-        np.minimum(high, _UNLIMITED),
-        np.maximum(low, -_UNLIMITED),
-        np.zeros(2 * n, dtype=np.int32),
-    )
-    return a + scale * x[:n] if flag > 0 else a

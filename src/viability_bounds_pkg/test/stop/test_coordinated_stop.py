@@ -10,7 +10,8 @@ from scipy.optimize import lsq_linear
 from stopping_arm import FEW_STEPS, Arm, H
 
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
-from viability_bounds_pkg.stop import CoordinatedStop, within_torque_limits
+from viability_bounds_pkg.robot.dynamics import within_torque_limits
+from viability_bounds_pkg.stop import CoordinatedStop
 from viability_bounds_pkg.viability import BoundsSolver
 
 FIELDS = ("q_min", "q_max", "v_max", "a_min", "a_max")
