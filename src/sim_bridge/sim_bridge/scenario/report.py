@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.scenario.events import EnableTorque, Event, PoseGoal, TrajectoryGoal
 from sim_bridge.scenario.scenario import ScenarioConfiguration
+from viability_bounds_pkg.joint_limits import speed_limits
 from viability_bounds_pkg.robot.configuration import units_of
 
 Array = NDArray[np.float64]
@@ -202,6 +203,7 @@ def _metrics(
         ),
         "max_torque_ratio": float(ratio),
         "max_torque_rate_ratio": None if rate is None else _or_none(rate),
+        "bounds_relaxed_steps": int(controller.get("bounds_relaxed_steps", 0)),
         "final_position_error_m": _or_none(errors[-1, 0]),
         "final_orientation_error_rad": _or_none(errors[-1, 1]),
         "max_trajectory_error_m": _or_none(worst),
@@ -354,6 +356,10 @@ def _draw(
         for axis, limits in ((left, (lower[j], upper[j])), (right, (-1.0, 1.0))):
             for limit in limits:
                 axis.axhline(limit, **_LIMIT)
+    rooms = np.stack([run.q - low, high - run.q])
+    speeds = config.velocity_max, config.velocity_offset, config.deceleration_limit
+    for sign, limit in zip((-1.0, 1.0), speed_limits(rooms, *speeds), strict=True):
+        axes[1, 0].plot(run.t, sign * limit[:, j], **_LIMIT)  # where it depends on position
     axes[0, 0].set(title=f"{run.joints[j]}, the joint nearest to a limit")
     axes[0, 1].set(title="all joints, limits at -1 and 1")
     axes[0, 1].legend(run.joints, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
