@@ -8,14 +8,18 @@ from contextlib import closing
 from xml.etree import ElementTree
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 pytest.importorskip("pylibfranka")
 pytest.importorskip("franky_sim")
 
+import mujoco
+
 from franka_bridge.node.franka_parameters import SimulationConfiguration
 from franka_bridge.simulated_arm import SimulatedArm, SimulationError
 from viability_bounds_pkg.parameter import read
+from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.robot.files import read_urdf
 from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import read_config
@@ -97,3 +101,20 @@ def test_limits_of_the_parameter_file_are_those_of_the_urdf_or_narrower():
         assert given.torque_max[j] == float(limit.get("effort"))
         assert given.velocity_offset[j] == float(curve.get("velocity_offset"))
         assert given.deceleration_limit[j] == float(curve.get("deceleration_limit"))
+
+
+def test_torque_limits_leave_room_for_the_gravity_that_the_robot_adds():
+    """It is not the model's: the simulated hand weighs less."""
+    given, rng = config(), np.random.default_rng(0)
+    model = load_model(given, read_urdf(given.robot_description))
+    data, differences = model.createData(), []
+    with closing(SimulatedArm(ADDRESS, given.start_positions, Record(), waits=True)) as arm:
+        simulator = arm._simulator
+        for q in rng.uniform(given.position_min, given.position_max, (500, 7)):
+            simulator.data.qpos[:7] = q
+            mujoco.mj_forward(simulator.model, simulator.data)
+            added = simulator.data.qfrc_bias[:7]
+            differences.append(added - pin.computeGeneralizedGravity(model, data, q))
+    worst = np.abs(differences).max(axis=0)
+    assert worst[1] > 0.3  # N m
+    assert (worst <= given.torque_max - read_config("fr3", "controller_node")["torque_max"]).all()
