@@ -77,6 +77,11 @@ def make_controller(
     model = load_model(config, urdf)
     if node is not None:
         warn_of_unusual(node, config, urdf)
+        if config.collision.bodies and not config.collision.collision_avoidance:
+            node.get_logger().warning(
+                "parameter 'obstacles' is given, but 'collision_avoidance' is false: the arm does "
+                "not avoid them"
+            )
     roots = ", ".join(each.name for each in model.frames if each.parentJoint == 0)
     base = _frame(model, config.base_frame, "base_frame", f"a frame fixed to the root: {roots}")
     if base.parentJoint != 0:

@@ -133,21 +133,7 @@ class ControllerNode(ArmNode):
         period = min(config.bounds_timeout, config.state_timeout) / 4
         self._watchdog = steady_timer(self, period, self._watch)
         self._diagnostics = Diagnostics(self, self._report, self.publisher_watch)
-        if config.collision.bodies and not config.collision.collision_avoidance:
-            self.get_logger().warning(
-                "parameter 'obstacles' is given, but 'collision_avoidance' is false: the arm does "
-                "not avoid them"
-            )
-        clipped = "; torque_rate_max is clipped: limits are not promised with it"
-        gravity = "with" if config.command_includes_gravity else "without"
-        avoiding = "with" if config.collision.collision_avoidance else "without"
-        self.announce(
-            config.joints,
-            config.rate_hz,
-            f"{config.start_control} control, torques {gravity} gravity, integral action "
-            f"{config.integral.integral_action}, {avoiding} collision avoidance"
-            f"{clipped if config.clips_torque_rates else ''}",
-        )
+        self.announce(config.joints, config.rate_hz, config.summary)
 
     def _configure(self, config: ControllerConfiguration) -> None:
         self._config = config

@@ -266,6 +266,18 @@ class ControllerConfiguration(
         """Whether torques are clipped to rates, so that no other limit is promised."""
         return bool(np.isfinite(self.torque_rate_max).any())
 
+    @property
+    def summary(self) -> str:
+        """What kind of control it is, in words."""
+        gravity = "with" if self.command_includes_gravity else "without"
+        avoiding = "with" if self.collision.collision_avoidance else "without"
+        clipped = "; torque_rate_max is clipped: limits are not promised with it"
+        return (
+            f"{self.start_control} control, torques {gravity} gravity, integral action "
+            f"{self.integral.integral_action}, {avoiding} collision avoidance"
+            f"{clipped if self.clips_torque_rates else ''}"
+        )
+
     def __post_init__(self) -> None:
         """Check all that does not depend on the URDF, and make the settings."""
         super().__post_init__()
