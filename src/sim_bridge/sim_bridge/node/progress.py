@@ -9,7 +9,7 @@ import numpy as np
 
 from sim_bridge.node.run_recorder import RunRecorder
 from sim_bridge.scenario.scenario import ScenarioConfiguration
-from viability_bounds_pkg.robot.configuration import units_of
+from viability_bounds_pkg.robot.urdf_joints import units_of
 
 _WAIT_SHOWN_AFTER = 10.0  # s
 

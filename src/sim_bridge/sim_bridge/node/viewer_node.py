@@ -34,13 +34,13 @@ from viability_bounds_pkg.robot.configuration import (
     LimitedRobotConfiguration,
     TaskFrames,
     load_model,
-    units_of,
 )
 from viability_bounds_pkg.robot.description import frame_id
 from viability_bounds_pkg.robot.files import RobotDescriptionError
 from viability_bounds_pkg.robot.gravity import TorqueConvention, gravity_beyond
 from viability_bounds_pkg.robot.locked_joints import LockedJoints
 from viability_bounds_pkg.robot.payload import Payload
+from viability_bounds_pkg.robot.urdf_joints import units_of
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
 from viability_bounds_pkg.ros.parameters import NodeParameters

@@ -18,7 +18,7 @@ from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.scenario.events import EnableTorque, Event, PoseGoal, TrajectoryGoal
 from sim_bridge.scenario.scenario import ScenarioConfiguration
 from viability_bounds_pkg.joint_limits import speed_limits
-from viability_bounds_pkg.robot.configuration import units_of
+from viability_bounds_pkg.robot.urdf_joints import units_of
 
 Array = NDArray[np.float64]
 Metrics = dict[str, Any]

@@ -36,7 +36,8 @@ from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import check_writable, write_whole
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter_files import ParameterFileError, read_files
-from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration, units_of
+from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration
+from viability_bounds_pkg.robot.urdf_joints import units_of
 
 Array = NDArray[np.float64]
 

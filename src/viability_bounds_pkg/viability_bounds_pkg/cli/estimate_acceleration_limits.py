@@ -41,7 +41,7 @@ from viability_bounds_pkg.estimate.worst_case import (
     WorstCases,
 )
 from viability_bounds_pkg.parameter_files import ParameterFileError
-from viability_bounds_pkg.robot.configuration import list_units
+from viability_bounds_pkg.robot.urdf_joints import list_units
 
 
 def _count(text: str) -> int:

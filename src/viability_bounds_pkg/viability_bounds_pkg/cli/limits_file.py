@@ -17,8 +17,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.parameter_files import read_files
-from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration, units_of
+from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration
 from viability_bounds_pkg.robot.description import build_model
+from viability_bounds_pkg.robot.urdf_joints import units_of
 
 Array = NDArray[np.float64]
 

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import ClassVar
 from xml.etree import ElementTree
 
@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.exceptions import SettingError, did_you_mean
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -36,19 +36,17 @@ from viability_bounds_pkg.robot.mistakes import (
     inertial_oddities,
     speed_limit,
 )
+from viability_bounds_pkg.robot.urdf_joints import (
+    LIMITS_OF_URDF,
+    joint_elements,
+    urdf_limit,
+    urdf_limits,
+)
 
 Array = NDArray[np.float64]
 
 TOPIC = "topic"
 """Value of ``robot_description`` that asks for what the topic of that name carries."""
-
-LIMITS_OF_URDF = {
-    "position_min": "lower",
-    "position_max": "upper",
-    "velocity_max": "velocity",
-    "torque_max": "effort",
-}
-"""Parameters that are taken from the URDF where they are not given, and its attribute."""
 
 _TURNS_MAX = 2.0
 """Turns of a joint with limits from which on its angles are surely degrees."""
@@ -227,63 +225,6 @@ class TaskFrames:
         return tuple(self.end_effector_frame.split()) or ("",)
 
 
-@lru_cache(maxsize=16)
-def urdf_limits(source: str, joints: tuple[str, ...]) -> Mapping[str, list[float | None]]:
-    """Return the limits that a URDF gives joints, in their order, by `LIMITS_OF_URDF`.
-
-    Read once: parameters may change while nodes control a robot. Limits are in rad, rad/s and N m,
-    and None where there is none to use.
-
-    Raises:
-        SettingError: there is no such URDF, or it lacks a joint.
-    """
-    try:
-        elements = _urdf_joints(read_urdf(source), joints)
-    except RobotDescriptionError as error:
-        raise SettingError("robot_description", source, f"a URDF ({error})") from error
-    return {name: [_limit(each, key) for each in elements] for name, key in LIMITS_OF_URDF.items()}
-
-
-def _urdf_joints(urdf: str, joints: Sequence[str]) -> list[ElementTree.Element]:
-    """Return the elements of a URDF's joints; raise `SettingError` if it lacks one."""
-    # Those of transmissions have the same names, and nothing to compare with.
-    elements = {
-        each.get("name", ""): each for each in ElementTree.fromstring(urdf).iterfind("joint")
-    }
-    for name in joints:
-        if name not in elements:
-            movable = [each for each, e in elements.items() if e.get("type") != "fixed"]
-            hint = did_you_mean(name, movable) or f": {', '.join(movable)}"
-            raise SettingError("joints", name, f"joints of the URDF{hint}")
-    return [elements[name] for name in joints]
-
-
-def units_of(urdf: str, joints: Sequence[str]) -> list[str]:
-    """Return the unit of each joint's position: "m" of slides, "rad" of others."""
-    kinds = [each.get("type") for each in _urdf_joints(urdf, joints)]
-    return ["m" if kind == "prismatic" else "rad" for kind in kinds]
-
-
-def list_units(units: Sequence[str], per: str = "") -> str:
-    """Return the unit of all joints, such as "rad/s, m/s of slides", from that of each."""
-    kinds = [f"{unit}{per}" for unit in ("rad", "m") if unit in units]
-    return f"{', '.join(kinds)} of slides" if len(kinds) > 1 else kinds[0]
-
-
-def _limit(joint: ElementTree.Element, key: str) -> float | None:
-    """Return a limit of a joint of a URDF, None where there is none to use."""
-    if joint.get("type") == "continuous" and key in ("lower", "upper"):
-        return math.inf if key == "upper" else -math.inf
-    limit = joint.find("limit")
-    try:
-        # The format gives positions a default of 0.
-        value = float("nan" if limit is None else limit.get(key, "0"))
-    except ValueError:
-        return None
-    usable = math.isfinite(value) and (value > 0.0 or key in ("lower", "upper"))
-    return value if usable else None
-
-
 def check_with_urdf(config: RobotConfiguration, urdf: str) -> list[str]:
     """Return what is unusual about parameters of a robot, a line each.
 
@@ -294,7 +235,7 @@ def check_with_urdf(config: RobotConfiguration, urdf: str) -> list[str]:
     Raises:
         SettingError: a joint that the URDF does not have, or angles that must be degrees.
     """
-    elements = _urdf_joints(urdf, config.joints)
+    elements = joint_elements(urdf, config.joints)
     lines = [line for j, joint in enumerate(elements) for line in _unusual(config, j, joint)]
     root = ElementTree.fromstring(urdf)
     lines += _unusual_locked(config, root)
@@ -305,7 +246,9 @@ def _unusual_locked(config: RobotConfiguration, root: ElementTree.Element) -> It
     joints = {each.get("name", ""): each for each in root.iterfind("joint")}
     for name, q in config.locked.items():
         joint = joints.get(name)
-        low, high = (None if joint is None else _limit(joint, key) for key in ("lower", "upper"))
+        low, high = (
+            None if joint is None else urdf_limit(joint, key) for key in ("lower", "upper")
+        )
         if low is None or high is None or low - _SLACK <= q <= high + _SLACK:
             continue
         yield (
@@ -325,7 +268,7 @@ def _unusual(config: RobotConfiguration, j: int, joint: ElementTree.Element) -> 
     if joint.get("type") == "prismatic" and config.continuous[j]:
         raise SettingError("position_max", config.position_max, f"finite for {name}: it slides")
     for parameter, key in LIMITS_OF_URDF.items():
-        values, of_urdf = getattr(config, parameter, ()), _limit(joint, key)
+        values, of_urdf = getattr(config, parameter, ()), urdf_limit(joint, key)
         if not len(values) or of_urdf is None or math.isinf(of_urdf):
             continue
         excess = of_urdf - values[j] if key == "lower" else values[j] - of_urdf

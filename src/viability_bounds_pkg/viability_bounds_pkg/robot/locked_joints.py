@@ -8,9 +8,10 @@ from collections.abc import Mapping, Sequence
 
 import pinocchio as pin
 
-from viability_bounds_pkg.robot.configuration import RobotConfiguration, units_of
+from viability_bounds_pkg.robot.configuration import RobotConfiguration
 from viability_bounds_pkg.robot.description import frame_id, posture, tell_apart, whole_model
 from viability_bounds_pkg.robot.payload import Payload
+from viability_bounds_pkg.robot.urdf_joints import units_of
 
 PERIOD = 0.1
 """Between two looks at the joints, s."""
