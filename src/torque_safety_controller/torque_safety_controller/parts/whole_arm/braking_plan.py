@@ -292,31 +292,3 @@ class PlanTorques:
         peaks = loads.max(axis=1)
         slack = 1.0 - peaks.max(axis=1)
         return BrakingPlans(periods, samples, tau, loads, peaks, slack, beyond)
-
-
-def torque_change(
-    clock: float, periods: Array, by_q: Array, by_v: Array, M: Array, dt: float
-) -> Array:
-    """Return how the torques at a sample change with the acceleration of this control step.
-
-    With the acceleration of the plan, the rest of the plan stays what it is. With another one the
-    arm is elsewhere after the step, and brakes from there in the periods that are left: the
-    torques at the time of the sample change by ``result @ (a - plan)``, to first order.
-
-    Args:
-        clock: of the sample, periods from the beginning of the step; at least 1 is assumed.
-        periods: of the plan from the state in which the step begins, shape (n,).
-        by_q: derivative of the torque by positions at the sample, shape (n, n).
-        by_v: by velocities, shape (n, n).
-        M: by accelerations, shape (n, n).
-        dt: control period, s.
-
-    Returns:
-        Shape (n, n), N m s^2/rad.
-    """
-    rest = np.maximum(periods - 1.0, 1.0)
-    left = 1.0 - np.minimum(max(clock - 1.0, 0.0), rest) / rest
-    q_a = 0.5 * dt * dt * (1.0 + rest * (1.0 - left * left))
-    a_a = np.where(left > 0.0, -1.0 / rest, 0.0)
-    change: Array = by_q * q_a + by_v * (dt * left) + M * a_a
-    return change

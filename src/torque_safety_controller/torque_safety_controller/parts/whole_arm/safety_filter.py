@@ -15,7 +15,7 @@ planned.
 from __future__ import annotations
 
 from collections import Counter
-from math import inf, log, sqrt
+from math import inf, log
 from typing import Any
 
 import numpy as np
@@ -31,8 +31,8 @@ from torque_safety_controller.parts.whole_arm.braking_plan import (
     PlanTorques,
     braking_periods,
     narrow,
-    torque_change,
 )
+from torque_safety_controller.parts.whole_arm.plan_rows import PlanRows
 from torque_safety_controller.qp import AccelerationRange, LinearConstraints
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.step import Part, Step, joints_beyond
@@ -41,26 +41,9 @@ from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
 
-KEPT = 0.01
-"""Further share that the constraints on a step leave, so that its trial seldom fails."""
-
-START_SHARE = 0.002
-"""What the torque of the step itself may use of that: else an arm that stands where it leaves no
-more could not even start to move away from there."""
-
 LOST = 0.07
 """Share of a torque limit by which a plan may pass it, after a disturbance, and still be followed
 as far as the motors can; beyond, the bounds alone count."""
-
-NEAR = 0.6
-"""Share of a torque limit above which a plan's torque constrains the step."""
-
-APPROACH_TIME = 0.04
-"""Time constant with which a step may use up what a plan leaves of a torque limit, s."""
-
-RETURN_TIME = 0.12
-"""Time constant with which a step leads back to what a plan is to leave, s: gently, because noise
-of the states moves plans as well."""
 
 USUAL_TIME = 0.3
 """Time of plans without a reason for another, s."""
@@ -154,8 +137,8 @@ class SafetyFilter(Part):
             position_min + clear, position_max - clear, TOLERANCE * clear, braking, dt, c, d
         )
         self._plans = PlanTorques(model, self._limits, self.usable)
-        self._model, self._data, self._dt = model, model.createData(), dt
-        self._upper_triangle = np.triu(np.ones((n, n), dtype=bool))  # all that Pinocchio gives
+        self._rows = PlanRows(model, self.usable, dt)
+        self._model, self._dt = model, dt
         self._turn = 0
         self._time = USUAL_TIME  # T of the plan in hand
         self._periods: Array | None = None  # of the plan in hand; None without one
@@ -225,8 +208,7 @@ class SafetyFilter(Part):
     ) -> LinearConstraints | None:
         """Bring the plan to the present state; return the constraints on the step's accelerations.
 
-        They are torque limits of the plan to first order, approached with `APPROACH_TIME`; None
-        where all are far, or no plan is near. The plan's acceleration keeps to them.
+        They are those of `PlanRows`; None where no plan is near, too.
 
         Args:
             q: positions, shape (n,), rad.
@@ -253,7 +235,7 @@ class SafetyFilter(Part):
         self.lower, self.upper = narrow(q, v, self.plan, lower, upper, self._limits)
         most = float((plans.peaks[chosen] * self._of_limit).max())
         self.lost = not most <= 1.0 + LOST
-        return self._rows(plans, chosen) if most <= 1.0 else None
+        return self._rows.of(plans, chosen) if most <= 1.0 else None
 
     def passed(self, a: Array) -> Array:
         """Return `a`, or what is nearest to it of the trials on the way to the plan in hand.
@@ -313,36 +295,6 @@ class SafetyFilter(Part):
             plans.slack[1] >= min(plans.slack[0], 0.0) and plans.beyond[1] <= plans.beyond[0]
         )
         return plans, int(better)
-
-    def _rows(self, plans: BrakingPlans, chosen: int) -> LinearConstraints | None:
-        """Return rows for joints of large torque: at first, when it is largest, and at rest."""
-        loads, dt = plans.loads[chosen], self._dt
-        # With fewer samples the largest torque would move to and fro between them.
-        busiest = loads[FIRST + 1 :].argmax(axis=0) + FIRST + 1
-        last = len(loads) - 1
-        joints: dict[int, list[int]] = {}
-        for j in np.flatnonzero(plans.peaks[chosen] > NEAR).tolist():
-            for k in {FIRST, int(busiest[j]), last}:
-                if loads[k, j] > NEAR:
-                    joints.setdefault(k, []).append(j)
-        rows, upper = [], []
-        clock, q, v, a = (each[chosen] for each in plans.samples)
-        for k, own in joints.items():
-            by_q, by_v, M = pin.computeRNEADerivatives(self._model, self._data, q[k], v[k], a[k])
-            M = np.where(self._upper_triangle, M, M.T)
-            change = torque_change(clock[k], plans.periods[chosen], by_q, by_v, M, dt)
-            for j in own:
-                tau = plans.tau[chosen, k, j]
-                row = change[j] if tau > 0.0 else -change[j]
-                kept = KEPT if k != FIRST else KEPT - START_SHARE
-                left = (1.0 - kept) * self.usable[j] - abs(tau)
-                size = max(sqrt(row @ row), 1e-9)
-                share = min(dt / (APPROACH_TIME if left > 0.0 else RETURN_TIME), 1.0)
-                rows.append(row / size)
-                upper.append((share * left + float(row @ self.plan)) / size)
-        if not rows:
-            return None
-        return LinearConstraints(np.array(rows), np.full(len(rows), -np.inf), np.array(upper))
 
     def _keep_plan_after(self, a: Array, other: float) -> bool:
         """Keep the safe plan after a step of `a` that needs least; return whether there is one.
