@@ -19,7 +19,7 @@ it, says where it leaves the paper, and proves that nothing in it grows for ever
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,21 +69,26 @@ class TaskLaw(IntegralLaw):
     Args:
         settings: their number of joints stays.
         m: rows of the task's Jacobian.
-        memory: type of the named tuple; its `integral` gets m numbers, `J` shape (m, n), all
+
+    Attributes:
+        MEMORY: type of the named tuple; its `integral` gets m numbers, `J` shape (m, n), all
             others n numbers.
 
     Raises:
         TaskShapeError: `m` leaves n joints no null space.
     """
 
-    def __init__(self, settings: IntegralSettings, m: int, memory: Any) -> None:
+    MEMORY: ClassVar[Any]
+
+    def __init__(self, settings: IntegralSettings, m: int) -> None:
         n = len(settings.budget)
         if not 0 < m < n:
             raise TaskShapeError(
                 f"a task of {m} rows for {n} joints; null-space compliance needs 1 to {n - 1} rows"
             )
         shapes = {"integral": (m,), "J": (m, n)}
-        super().__init__(settings, memory(*(np.zeros(shapes.get(k, n)) for k in memory._fields)))
+        arrays = (np.zeros(shapes.get(name, n)) for name in self.MEMORY._fields)
+        super().__init__(settings, self.MEMORY(*arrays))
 
     def reset(self, arm: ArmTerms) -> None:
         """See `IntegralLaw`."""
@@ -121,21 +126,10 @@ class TaskLaw(IntegralLaw):
 
 
 class NullspaceCompliance(TaskLaw):
-    """Additional torque that is stiff in a task of m < n rows.
+    """Additional torque that is stiff in a task of m < n rows."""
 
-    Args:
-        settings: their number of joints stays.
-        m: rows of the task's Jacobian.
-
-    Raises:
-        TaskShapeError: `m` leaves n joints no null space.
-    """
-
+    MEMORY = Memory
     memory: Memory
-
-    def __init__(self, settings: IntegralSettings, m: int) -> None:
-        super().__init__(settings, m, Memory)
-        self._none = np.zeros_like(self.saturated)
 
     @property
     def leak_rates(self) -> dict[str, float]:
@@ -170,7 +164,7 @@ class NullspaceCompliance(TaskLaw):
         if not math.isfinite(sum(torque.tolist()) + sum(s.tolist()) + sum(root.tolist())):
             raise ValueError("all numbers must be finite")
         self.memory = Memory(a, s, integral, root, v.copy(), J.copy())
-        self.saturated = np.abs(torque) >= _AT_LIMIT * settings.budget if limited else self._none
+        self.saturated = limited & (np.abs(torque) >= _AT_LIMIT * settings.budget)
         return torque
 
     def initialise(self, torque: Array, arm: ArmTerms) -> Array:

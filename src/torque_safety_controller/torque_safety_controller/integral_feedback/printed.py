@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from torque_safety_controller.anti_windup import project_to_limits, scale_to_limits
 from torque_safety_controller.integral_feedback.law import ArmTerms
 from torque_safety_controller.integral_feedback.nullspace import TaskLaw
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.integral_feedback.task_inverse import dynamically_consistent_inverse
 
 Array = NDArray[np.float64]
@@ -50,20 +49,10 @@ class PrintedMemory(NamedTuple):
 
 
 class PrintedCompliance(TaskLaw):
-    """Additional torque of (16), (21) and (26), with the torque of the gains limited.
+    """Additional torque of (16), (21) and (26), with the torque of the gains limited."""
 
-    Args:
-        settings: their number of joints stays.
-        m: rows of the task's Jacobian.
-
-    Raises:
-        TaskShapeError: `m` leaves n joints no null space.
-    """
-
+    MEMORY = PrintedMemory
     memory: PrintedMemory
-
-    def __init__(self, settings: IntegralSettings, m: int) -> None:
-        super().__init__(settings, m, PrintedMemory)
 
     @property
     def leak_rates(self) -> dict[str, float]:
