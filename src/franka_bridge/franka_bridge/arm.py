@@ -70,6 +70,7 @@ class FrankaArm:
 
     Attributes:
         state: the last one read.
+        in_turn: whether that is the one after the state read before.
         lost: periods under torque control whose states were not read.
 
     Raises:
@@ -81,6 +82,7 @@ class FrankaArm:
         self._config = RealtimeConfig.kEnforce if real_time else RealtimeConfig.kIgnore
         self._robot: Robot | None = None
         self._control: ActiveControlBase | None = None
+        self.in_turn = True
         self.lost = 0
         self.state: RobotState = self.connect()
 
@@ -131,7 +133,9 @@ class FrankaArm:
                 self.state = self._connected().read_once()
             else:
                 self.state, passed = self._control.readOnce()
-                self.lost += max(0, round(1e3 * passed.to_sec()) - 1)
+                periods = round(1e3 * passed.to_sec())
+                self.in_turn = periods <= 1
+                self.lost += max(0, periods - 1)
         return self.state
 
     def write(self, torque: Sequence[float], last: bool = False) -> None:

@@ -29,8 +29,14 @@ Array = NDArray[np.float64]
 _OBSERVER_TIME = 0.01
 """Of the stop law's observer, s: measured velocities have noise."""
 
-_LAW_SHARE = 0.9
-"""Of the limits of torque rates that the stop law uses: gravity changes as well."""
+_SAME_TORQUE = 1e-3
+"""Largest difference of what was sent and what the robot has of it, N m."""
+
+_WITHIN = 1.0 - 1e-6
+"""Share of steps of the torque that is used: states have torques with seven digits."""
+
+_LEAST_RANGE = 0.1
+"""Of the torques that may be sent, in steps of the torque, where some were lost."""
 
 
 class Drive:
@@ -47,8 +53,7 @@ class Drive:
     Attributes:
         stop: the stop law.
         payload: what the arm carries; `told` is what the robot knows of it.
-        clipped: periods in which torques were not those of the command or law, by limits of
-            torque or torque rate.
+        clipped: periods in which limits of torque or torque rate let no command through.
     """
 
     def __init__(
@@ -67,17 +72,17 @@ class Drive:
         self._gravity: Gravity | None = gravity_beyond(model, gravity_included)
         self._not_reported = gravity_beyond(model, effort_included)
         self._added = gravity_beyond(known, False) or (lambda q: np.zeros_like(q))
-        self._tau_max, self._step = tau_max, rate_max * dt
+        self._tau_max, self._step = tau_max, _WITHIN * rate_max * dt
         self.stop = CoordinatedStop(
             model,
             limits,
             tau_max,
             dt,
             observer_time=_OBSERVER_TIME,
-            torque_step=_LAW_SHARE * self._step,
+            soft=True,
         )
         self.clipped = 0
-        self._sent = np.zeros(len(limits))
+        self._sent = self._applied = np.zeros(len(limits))
         self._by_law = True  # until commands act by themselves
 
     @property
@@ -107,7 +112,7 @@ class Drive:
             v: velocities, rad/s.
             applied: torques that the robot has as the last ones sent, N m.
         """
-        self._sent = applied.copy()
+        self._sent = self._applied = applied.copy()
         self._start_law(q, v)
 
     def asked(self, q: Array, command: Array) -> Array:
@@ -119,7 +124,13 @@ class Drive:
         return measured if self._not_reported is None else measured - self._not_reported(q)
 
     def torque(
-        self, q: Array, v: Array, command: Array | None, held: bool, applied: Array
+        self,
+        q: Array,
+        v: Array,
+        command: Array | None,
+        held: bool,
+        applied: Array,
+        in_turn: bool = True,
     ) -> Array:
         """Return what to send, N m: finite, within the limits of torque and torque rate.
 
@@ -129,30 +140,42 @@ class Drive:
             command: torques; None to stop and hold.
             held: whether the command is one of an earlier period.
             applied: torques that the robot has as the last ones sent, N m.
+            in_turn: whether the state is that of the period after the last one.
         """
         added, sent = self._added(q), self._sent
-        # A step from what was sent last, and from what the robot has if that was lost.
-        lowest = np.maximum(np.maximum(sent, applied) - self._step, -self._tau_max)
-        highest = np.minimum(np.minimum(sent, applied) + self._step, self._tau_max)
+        if not (in_turn and _same(applied, sent)):
+            self.stop.forget_step()
+        # A step from what was sent last, and from what the robot has if that may be lost.
+        base = applied if _same(applied, self._applied) else sent
+        self._applied = applied
+        highest = np.minimum(np.minimum(sent, base) + self._step, self._tau_max)
+        lowest = np.maximum(np.maximum(sent, base) - self._step, -self._tau_max)
+        lowest = np.minimum(lowest, highest - _LEAST_RANGE * self._step)
         tau, follows = None, False
         if command is not None:
             tau = np.clip(self.asked(q, command), -self._tau_max, self._tau_max)
-            steps = np.clip(tau - added, lowest, highest) - (tau - added)
-            follows = not (held or steps.any())
+            wanted = tau - added
+            through = bool(((lowest <= wanted) & (wanted <= highest)).all())
+            self.clipped += not through
+            follows = through and not held
         if not (self._by_law or follows):
             self._start_law(q, v)
+        self.stop.torque_range = tuple(
+            np.clip(each + added, -self._tau_max, self._tau_max) for each in (lowest, highest)
+        )
         if tau is None:
             tau = self.stop.torque(q, v)
         elif self._by_law:
             tau = self.stop.follow(q, v, tau)
             self._by_law = held or not self.stop.returned
-        wanted = tau - added
-        sent = np.minimum(np.maximum(wanted, lowest), highest)
-        self.clipped += bool((sent != wanted).any())
+        sent = np.minimum(np.maximum(tau - added, lowest), highest)
         self._sent = np.where(np.isfinite(sent), sent, self._sent)
         return self._sent
 
     def _start_law(self, q: Array, v: Array) -> None:
-        last = self._sent + self._added(q)
-        self.stop.start(q, v, np.clip(last, -self._tau_max, self._tau_max))
+        self.stop.start(q, v)
         self._by_law = True
+
+
+def _same(one: Array, other: Array) -> bool:
+    return bool((np.abs(one - other) <= _SAME_TORQUE).all())

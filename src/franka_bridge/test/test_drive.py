@@ -226,3 +226,28 @@ def test_the_arm_comes_to_rest_although_torques_come_late():
         arm.q, arm.v = arm.q + H * arm.v, arm.v + H * a
     assert arm.drive.stop.at_rest
     np.testing.assert_allclose(arm.v, 0.0, atol=5e-3)  # rad/s
+
+
+def test_torques_that_act_late_or_never_throw_no_joint():
+    """What the arm does otherwise than asked is no disturbance, for the law to act against."""
+    rng = np.random.default_rng(3)
+    controller = Controller(rng)
+    arm = Arm(controller.start)
+    arm.begin()
+    on_its_way, lost, beyond, fastest = arm.sent, 0, 0.0, 0.0
+    for _ in range(2000):
+        acting = arm.sent  # in this period still
+        if rng.random() < 0.1:
+            lost += 1
+        else:
+            arm.sent = on_its_way
+            command = arm.command_for(controller.acceleration(arm.q, arm.v))
+            on_its_way = arm.drive.torque(arm.q, arm.v, command, False, acting, lost == 0).copy()
+            lost = 0
+        a = pin.aba(arm.model, arm.data, arm.q, arm.v, acting + arm.gravity())
+        arm.q, arm.v = arm.q + H * arm.v, arm.v + H * a
+        lowest, highest = LIMITS.velocities(arm.q)
+        beyond = max(beyond, np.maximum(arm.v - highest, lowest - arm.v).max())
+        fastest = max(fastest, np.abs(arm.v).max())
+    assert fastest > 1.0
+    assert beyond < 0.05  # rad/s: the limits are for torques that act at once

@@ -34,7 +34,7 @@ so that the torque goes on from that of the stop without a step, and ends at tha
 Motors whose torque follows with a first-order lag 1 / omega make (q + v / omega, v + a / omega) a
 double integrator that the torques asked for drive at once. All of the law is for that state then.
 
-Where torques may change by a limited amount in each step, this is another limit of the motors.
+Where torques may change by a limited amount in each step, they are given a range for the next one.
 """
 
 from __future__ import annotations
@@ -109,12 +109,13 @@ class CoordinatedStop:
         observer_time: time constant of the observer of disturbances, s; inf for none. It needs
             velocities whose noise is far below the acceleration limits times this time.
         motor_lag: time constants of the motors' torques, shape (n,), s; none where not given.
-        torque_step: by which torques may change from step to step, shape (n,), N m; any where not
-            given. `start` must be told the motors' torque then.
+        soft: whether the arm comes to rest softly, as where torques may not change at once.
 
     Attributes:
         acceleration: chosen in the last step, rad/s^2.
         at_rest: whether the arm came to rest and is held.
+        torque_range: lowest and highest torques that the motors can give in the next step, each of
+            shape (n,), N m; to be written where they may not change at once.
         returned: whether commands have all of their effect, and the limits have let them through
             for `PASS_TIME`: then they may act by themselves.
 
@@ -131,7 +132,7 @@ class CoordinatedStop:
         *,
         observer_time: float = math.inf,
         motor_lag: ArrayLike | None = None,
-        torque_step: ArrayLike | None = None,
+        soft: bool = False,
     ) -> None:
         self._dynamics = Dynamics(model, limits.names)
         n = len(limits)
@@ -147,9 +148,8 @@ class CoordinatedStop:
         self._share = 0.0 if math.isinf(observer_time) else -math.expm1(-dt / observer_time)
         self._scale = 0.5 * (limits.a_max - limits.a_min)
         self._lag = lag if lag.any() else None
-        given = np.full(n, np.inf) if torque_step is None else torque_step
-        self._step = joint_array("torque_step", given, limits.names)
-        self._soonest = dt if np.isinf(self._step).all() else max(dt, SOFT_REST)
+        self.torque_range = -torques, torques
+        self._soonest = max(dt, SOFT_REST) if soft else dt
         clear = np.minimum(HOLD_CLEARANCE, 0.5 * (limits.q_max - limits.q_min))
         self._lowest, self._highest = limits.q_min + clear, limits.q_max - clear
         self.start(np.zeros(n), np.zeros(n))
@@ -178,8 +178,6 @@ class CoordinatedStop:
         if self._share and motor_torque is not None and acceleration is not None:
             besides = self._dynamics.torque(q, v, acceleration) - motor_torque
             self._disturbance = np.clip(besides, -self._tau_max, self._tau_max)
-        known = None if np.isinf(self._step).all() else motor_torque
-        self._last = known  # torques of the last step, where they matter
         self._M: Array | None = None
         self._resting = False  # the last step was one of a stop
         self._difference, self._share_left = np.zeros(n), 0.0
@@ -194,6 +192,10 @@ class CoordinatedStop:
     def time_to_rest(self, v: Array) -> float:
         """Return how long the arm takes to rest at most, but for a few steps, s."""
         return float((np.abs(v) / self._braking(v)).max())
+
+    def forget_step(self) -> None:
+        """The last torque did not act for just one step: learn no disturbance from it."""
+        self._M = None
 
     def torque(self, q: Array, v: Array, motor_torque: Array | None = None) -> Array:
         """Return the torques to ask of the motors for the next step of the drive, N m.
@@ -238,7 +240,7 @@ class CoordinatedStop:
         self._passed_for = self._passed_for + h if passed and command is not None else 0.0
         middle = q + 0.5 * h * v + 0.125 * h * h * a, v + 0.5 * h * a
         tau = self._dynamics.torque(*middle, a) - self._disturbance
-        low, high = self._torque_range()
+        low, high = self.torque_range
         feasible = bool(((tau >= low) & (tau <= high)).all())
         if self._share or not feasible:
             self._M = M = self._dynamics.mass_matrix(middle[0])
@@ -249,16 +251,7 @@ class CoordinatedStop:
                 a = self._dynamics.acceleration(*middle, tau + self._disturbance)
         self.acceleration = a
         self._expected = lead + h * a
-        if self._last is not None:
-            self._last = tau
         return tau
-
-    def _torque_range(self) -> tuple[Array, Array]:
-        """Return the lowest and the highest torques that the motors can give in this step, N m."""
-        low, high = -self._tau_max, self._tau_max
-        if self._last is None:
-            return low, high
-        return np.maximum(low, self._last - self._step), np.minimum(high, self._last + self._step)
 
     def _gentle_return(
         self, q: Array, v: Array, lower: Array, upper: Array

@@ -229,7 +229,7 @@ class FrankaNode(ArmNode):
         """Return the torques to send for the last state."""
         state = self._arm.state
         q, v, applied = map(np.array, (state.q, state.dq, state.tau_J_d))
-        return self._drive.torque(q, v, command, held, applied).tolist()
+        return self._drive.torque(q, v, command, held, applied, self._arm.in_turn).tolist()
 
     def _asked(self, tau: Array) -> Array:
         return self._drive.asked(np.array(self._arm.state.q), tau)
