@@ -21,19 +21,16 @@ from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.sensor import ForceTorqueReading
-from sim_bridge.command_path import CommandPath
 from sim_bridge.hardware import Sensing
-from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot, make_stop
+from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot
+from sim_bridge.node.drives import Drives
 from sim_bridge.node.topics import CLOCK, PAUSE, RECORDED, RESET
 from sim_bridge.node.world_subscriber import WorldSubscriber
 from sim_bridge.pace import Pace
 from viability_bounds_pkg.plausible import RESTART_GAP
-from viability_bounds_pkg.robot.configuration import load_model
-from viability_bounds_pkg.robot.gravity import gravity_beyond
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.commands import CommandStream
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
-from viability_bounds_pkg.ros.messages import PositionCommand, TorqueCommand, wrench_message
+from viability_bounds_pkg.ros.messages import wrench_message
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.robot_urdf import warn_of_unusual
@@ -52,8 +49,6 @@ RETRY_PERIOD = 0.03
 
 AHEAD = 20
 """Periods that a robot in lockstep goes on without its recorder; a socket's buffer keeps more."""
-
-_CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
 
 
 class BulletNode(ArmNode):
@@ -88,8 +83,9 @@ class BulletNode(ArmNode):
             config = self._node_parameters.configuration
             warn_of_unusual(self, config, config.urdf)
             self._robot = make_robot(config)
-            self._stop = make_stop(config)
-        self._config = config
+            self._refused: Counter[str] = Counter()
+            self._drives = Drives(config, self._robot, self._refused, self.get_logger().warning)
+        self._config, self._commands = config, self._drives.commands
         self._monitor = LimitMonitor.of(config)
         self._robot.monitor = self._monitor
         self._dt_ns = round(1e9 * config.dt)
@@ -98,7 +94,6 @@ class BulletNode(ArmNode):
         self._stamp = 0 if config.lockstep else self.get_clock().now().nanoseconds
         self._has_moved = False
         self._advanced = True
-        self._refused: Counter[str] = Counter()
         self._world = WorldSubscriber(
             self,
             self._robot,
@@ -110,16 +105,6 @@ class BulletNode(ArmNode):
         self._ft_publisher = self.stream(FT_WRENCH) if self._robot.sensor else None
         self._pace = Pace(config.rate_hz)
         self._sensing = Sensing(config.imperfections, config.torque_max, config.dt)
-        model = load_model(config, config.urdf)
-        self._gravity = gravity_beyond(model, config.command_includes_gravity)
-        self._not_reported = gravity_beyond(model, config.effort_includes_gravity)
-        self._commands = CommandStream(
-            config,
-            self._refused,
-            self.get_logger().warning,
-            self._asked,
-            lambda: CommandPath(config.imperfections),
-        )
         self._restart()
         self._make_interface()
         self.announce(config.joints, config.rate_hz, f"simulated, clock {config.clock}")
@@ -160,8 +145,7 @@ class BulletNode(ArmNode):
         seed = config.imperfections.imperfection_seed
         self._sensor = ForceTorqueReading(sensor, config.sensor, seed) if sensor else None
         self._monitor.reset()
-        self._commands.restart()
-        self._braked = 0
+        self._drives.restart()
         self._pace.restart()
         self._plan_pause()
         self._refused.clear()
@@ -184,8 +168,7 @@ class BulletNode(ArmNode):
         self._stamp += self._dt_ns
         self._advanced = False
         q, v, tau = self._reading
-        if self._not_reported is not None:
-            tau = tau - self._not_reported(q)
+        tau = self._drives.reported(q, tau)
         # New messages: nodes of this process may keep the last ones, and others get theirs later.
         state = self._state = JointState(
             name=self._names,
@@ -211,30 +194,8 @@ class BulletNode(ArmNode):
 
     def _advance(self) -> None:
         """Simulate the current period under the last command, or the robot's own law."""
-        config = self._config
         self._world.apply_due(self._stamp)
-        commands = self._commands
-        commands.proceed()
-        command = commands.acting
-        if not self._robot.finite:  # after a push beyond all measure: no law stops that
-            self._robot.brake(config.substeps, config.torque_max)
-        elif command is None:
-            # No command can have arrived before the first one's delay.
-            self._braked += self._pace.periods >= config.imperfections.command_delay
-            if self._stop is not None and commands.commanded:
-                self._robot.stop(self._stop, config.substeps)
-            else:
-                self._robot.brake(config.substeps, config.torque_max)
-        elif isinstance(command, TorqueCommand):
-            if self._stop is None or (commands.missed_in_row == 0 and not self._robot.returning):
-                if self._gravity is None:
-                    self._robot.step(self._given(command.tau), config.substeps)
-                else:
-                    self._robot.step_by(lambda: self._given(command.tau), config.substeps)
-            else:
-                self._robot.follow(self._stop, self._given(command.tau), config.substeps)
-        else:
-            self._robot.move(*command, config.torque_max, config.velocity_max, config.substeps)
+        self._drives.advance(self._pace.periods)
         self._reading = self._sensing.read(*self._true_state())
         self._pace.periods += 1
         self._has_moved = True
@@ -242,15 +203,6 @@ class BulletNode(ArmNode):
         if self._pace.periods >= self._pause_at:
             self._pause_at = math.inf
             self._pause()
-
-    def _asked(self, command: Array) -> Array:
-        """Return the torque that a command asks the motors for now, shape (n,), N m."""
-        return command if self._gravity is None else command + self._gravity(self.true_positions)
-
-    def _given(self, command: Array) -> Array:
-        """Return that torque within the limits of the motors, which they do not exceed."""
-        most = self._config.torque_max
-        return np.minimum(np.maximum(self._asked(command), -most), most)
 
     def _tick(self) -> None:
         """End a period in real time and begin the next."""
@@ -333,17 +285,13 @@ class BulletNode(ArmNode):
 
     # Diagnostics
 
-    def _control(self) -> str:
-        """Return what moves or holds the robot."""
-        if self._commands.acting is not None:
-            return _CONTROL[type(self._commands.acting)]
-        if self._stop is None or not self._commands.commanded:
-            return "brakes"
-        return "stopped" if self._stop.at_rest else "stopping"
-
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
         monitor, commands = self._monitor, self._commands
-        latencies, obstacles, control = commands.latencies, self._robot.obstacles, self._control()
+        latencies, obstacles, control = (
+            commands.latencies,
+            self._robot.obstacles,
+            self._drives.control,
+        )
         values = {
             "clock": "lockstep" if self._config.lockstep else "real_time",
             "paused": self._paused,
@@ -355,7 +303,7 @@ class BulletNode(ArmNode):
             "deadline_misses": commands.missed,
             "missed_deadlines_injected": commands.path.missed,
             "imperfections": ", ".join(self._config.imperfections.names) or "none",
-            "braked_periods": self._braked,
+            "braked_periods": self._drives.braked,
             "commands_refused": self._refused,
             "world_changes_pending": len(self._world),
             "contact_force_n": obstacles.force,
