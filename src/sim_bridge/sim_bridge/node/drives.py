@@ -45,10 +45,12 @@ class Drives:
         warn: Callable[..., object],
     ) -> None:
         self._config, self._robot, self._stop = config, robot, make_stop(config)
-        model, path = load_model(config, config.urdf), lambda: CommandPath(config.imperfections)
+        model = load_model(config, config.urdf)
         self._gravity = gravity_beyond(model, config.command_includes_gravity)
         self._not_reported = gravity_beyond(model, config.effort_includes_gravity)
-        self.commands = CommandStream(config, refused, warn, self._asked, path)
+        self.commands = CommandStream(
+            config, refused, warn, self._asked, lambda: CommandPath(config.imperfections)
+        )
         self.braked = 0
 
     def restart(self) -> None:
