@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages and service calls of a scenario's events, and their publisher."""
+"""The messages and service calls of a scenario's events, published and made in time."""
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -31,6 +33,7 @@ from sim_bridge.scenario.events import (
     TriggerCall,
 )
 from sim_bridge.scenario.scenario import Scenario
+from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.pose_trajectory import TrajectoryPoint
 from viability_bounds_pkg.ros.messages import pose_message, wrench_message
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, is_subscribed, set_stamp
@@ -39,6 +42,10 @@ _IN_FLIGHT_MAX = GOAL_QOS.depth - 2
 """Messages sent but not yet reported as received: a reader's queue is that long."""
 
 _SHAPES = {"box": Marker.CUBE, "sphere": Marker.SPHERE, "cylinder": Marker.CYLINDER}
+
+
+class ScenarioRefused(ArmSafetyError, RuntimeError):
+    """Another node refused a message or call of the scenario; the text says which and why."""
 
 
 class ServiceRequest(NamedTuple):
@@ -118,6 +125,10 @@ def change_parameters(node: str, values: Any) -> ServiceRequest:
 def pause(data: bool) -> ServiceRequest:
     """Return the call that pauses or resumes the robot."""
     return ServiceRequest("bullet_node/pause", SetBool, SetBool.Request(data=data))
+
+
+PAUSES = RESET, pause(False), change_parameters("bullet_node", {})
+"""Services of a robot that can be reset and paused."""
 
 
 def refusals(request: ServiceRequest, response: Any) -> Iterator[str]:
@@ -233,3 +244,48 @@ class ScheduledPublisher:
             self._publishers[message.topic].publish(message.content)
         self._sent += len(portion)
         return pending >= len(self._messages)
+
+
+class ScheduledCalls:
+    """Calls the services of a scenario when they are due, and others when asked.
+
+    Args:
+        node: calls them.
+        scenario: its service calls are made.
+        others: requests of the other services.
+    """
+
+    def __init__(self, node: Node, scenario: Scenario, others: Sequence[ServiceRequest]) -> None:
+        self._due = deque(each for each in scenario.events if isinstance(each, ServiceEvent))
+        self._clients = {
+            request.service: node.create_client(request.kind, request.service)
+            for request in (*others, *map(to_service, self._due))
+        }
+
+    def without_server(self, unused: Sequence[ServiceRequest]) -> list[str]:
+        """Return the services that nobody offers, but for those that are not used."""
+        names = {request.service for request in unused}
+        clients = self._clients.items()
+        return [name for name, each in clients if not (name in names or each.service_is_ready())]
+
+    def call(self, request: ServiceRequest, when: str = "") -> Iterator[str]:
+        """Call a service; yield what is waited for until it has answered.
+
+        Raises:
+            ScenarioRefused: the call was refused; `when` is part of the text.
+        """
+        answer = self._clients[request.service].call_async(request.content)
+        while not answer.done():
+            yield f"calling: there is no answer of {request.service}"
+        if reasons := "; ".join(refusals(request, answer.result())):
+            raise ScenarioRefused(f"{when}{request.service} refused: {reasons}")
+
+    def next_period(self, dt: int) -> int | None:
+        """Return the first period, of `dt` ns, when a call is due; None for none."""
+        return math.ceil(1e9 * self._due[0].time / dt - 1e-6) if self._due else None
+
+    def call_due(self, period: int, dt: int) -> Iterator[str]:
+        """Make the calls that are due when a period, of `dt` ns, begins; yield as `call`."""
+        while (due := self.next_period(dt)) is not None and due <= period:
+            event = self._due.popleft()
+            yield from self.call(to_service(event), f"at {event.time:g} s: ")

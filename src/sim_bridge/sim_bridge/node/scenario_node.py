@@ -7,7 +7,6 @@ import math
 import signal
 import sys
 import time
-from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,21 +19,19 @@ from sim_bridge.mcap_file import McapFile
 from sim_bridge.node.progress import Progress
 from sim_bridge.node.run_recorder import RunRecorder
 from sim_bridge.node.scenario_messages import (
+    PAUSES,
     RESET,
+    ScenarioRefused,
+    ScheduledCalls,
     ScheduledPublisher,
-    ServiceRequest,
     change_parameters,
     pause,
-    refusals,
     to_controller,
     to_robot,
-    to_service,
 )
-from sim_bridge.scenario.events import ServiceEvent
 from sim_bridge.scenario.report import RecordedRun, write_report
 from sim_bridge.scenario.scenario import ScenarioConfiguration
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
-from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import (
@@ -50,10 +47,6 @@ _POLL_PERIOD = 0.02
 _SHOW_PERIOD = 0.5
 _LEAD = 1.0
 """Time before the first goal on a robot that cannot pause: its messages arrive meanwhile, s."""
-
-
-class ScenarioRefused(ArmSafetyError, RuntimeError):
-    """Another node refused a message or call of the scenario; the text says which and why."""
 
 
 class ScenarioNode(ArmNode):
@@ -97,13 +90,7 @@ class ScenarioNode(ArmNode):
         self._world = ScheduledPublisher(
             self, config.robot_node, to_robot(config.plan, config.base_frame)
         )
-        self._due = deque(e for e in config.plan.events if isinstance(e, ServiceEvent))
-        own = RESET, pause(False), change_parameters("bullet_node", {})
-        self._service_clients = {
-            request.service: self.create_client(request.kind, request.service)
-            for request in (*own, *map(to_service, self._due))
-        }
-        self._of_pauses = {request.service for request in own}
+        self._calls = ScheduledCalls(self, config.plan, PAUSES)
         self._course = self._play()
         steady_timer(self, _POLL_PERIOD, self._proceed)
 
@@ -149,7 +136,7 @@ class ScenarioNode(ArmNode):
             yield from self._play_through()
             return
         before = self._first = self.recorder.stamp
-        yield from self._call(RESET)
+        yield from self._calls.call(RESET)
         while not self.recorder.answered == self.recorder.stamp > before:
             yield "resetting: there is no joint command for the start"
         # Resuming begins a new period: the first state in motion is the next.
@@ -159,16 +146,16 @@ class ScenarioNode(ArmNode):
         lockstep = self.robot["clock"] == "lockstep"
         begin, end = 0, self._duration
         while begin < end:
-            yield from self._call_services(begin)
+            yield from self._calls.call_due(begin, self._period)
             # In lockstep the robot pauses where a service is due.
-            halt = min(end, self._period_of(self._due[0])) if self._due and lockstep else end
+            halt = min(end, self._calls.next_period(self._period) or end) if lockstep else end
             left = 1e-9 * self._period * (halt - begin)
-            yield from self._call(change_parameters("bullet_node", {"pause_after": left}))
-            yield from self._call(pause(False))
+            yield from self._calls.call(change_parameters("bullet_node", {"pause_after": left}))
+            yield from self._calls.call(pause(False))
             while not self._is_paused_at(halt):
                 if not lockstep:
                     now = (self.recorder.stamp - self._first) // self._period
-                    yield from self._call_services(now)
+                    yield from self._calls.call_due(now, self._period)
                 yield "playing"
             begin = halt
 
@@ -179,7 +166,7 @@ class ScenarioNode(ArmNode):
         loaded, now = False, -lead
         while now < self._duration:
             loaded = loaded or self._load()
-            yield from self._call_services(now)
+            yield from self._calls.call_due(now, self._period)
             yield "playing"
             now = (self.recorder.stamp - self._first) // self._period
 
@@ -193,42 +180,19 @@ class ScenarioNode(ArmNode):
     def _stop(self) -> Iterator[str]:
         """Pause the robot if the scenario has begun and it can, and end."""
         if self._refused is not None and self._pauses:
-            yield from self._call(pause(True))
+            yield from self._calls.call(pause(True))
 
     def _missing(self) -> list[str]:
         """Return what is missing before the scenario can begin."""
-        unused = set() if self._pauses else self._of_pauses
-        clients = [each for each in self._service_clients.items() if each[0] not in unused]
+        unused = () if self._pauses else PAUSES
         topics = self._goals.without_subscriber() + self._world.without_subscriber()
         return (
             (["paused robot"] if self._pauses and self.robot.get("paused") != "True" else [])
             + ([] if self.recorder.stamp >= 0 else ["joint states"])
             + ([] if self.recorder.answered >= 0 else ["joint commands"])
-            + [f"service {name}" for name, client in clients if not client.service_is_ready()]
+            + [f"service {name}" for name in self._calls.without_server(unused)]
             + [f"subscriber of {topic}" for topic in topics]
         )
-
-    def _call(self, request: ServiceRequest, when: str = "") -> Iterator[str]:
-        """Call a service and wait for its answer.
-
-        Raises:
-            ScenarioRefused: the call was refused; `when` is part of the text.
-        """
-        answer = self._service_clients[request.service].call_async(request.content)
-        while not answer.done():
-            yield f"calling: there is no answer of {request.service}"
-        if reasons := "; ".join(refusals(request, answer.result())):
-            raise ScenarioRefused(f"{when}{request.service} refused: {reasons}")
-
-    def _call_services(self, period: int) -> Iterator[str]:
-        """Call the services that are due when a period, counted from the first, begins."""
-        while self._due and self._period_of(self._due[0]) <= period:
-            event = self._due.popleft()
-            yield from self._call(to_service(event), f"at {event.time:g} s: ")
-
-    def _period_of(self, event: ServiceEvent) -> int:
-        """Return the first period that begins at or after the time of an event."""
-        return math.ceil(1e9 * event.time / self._period - 1e-6)
 
     def _load(self) -> bool:
         """Send scheduled messages; return whether all were received."""
