@@ -18,6 +18,8 @@ Writes figures to results/ and tables to docs/results.md, and prints the tables.
   imperfect panda    one of the robots
   contrast           the moving picture of README
   theory             figures and tables of the pages under docs/theory (4 min)
+  fr3                a simulated FR3 at and beyond its limits, behind libfranka's protocol (45 min)
+  fr3 --rows lockstep    one row of its table
   soak               faults while the arm moves: restarts, wrong states, second nodes (3 min)
   all                the first four (default)
 USAGE
@@ -35,7 +37,7 @@ if [ "$what" = all ]; then
 fi
 what="${what//-/_}"
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | whole_arm | imperfect | contrast | theory | soak) ;;
+paper0 | paper1_integral | paper1_compliance | whole_arm | imperfect | fr3 | contrast | theory | soak) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2
