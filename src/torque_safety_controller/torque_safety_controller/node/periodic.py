@@ -218,11 +218,6 @@ class JointCommands:
                 raise SettingError("ros2_control_topic", ros2_control_topic, allowed) from error
             node.publisher_watch.add(self._efforts.topic_name)
 
-    @property
-    def stamp(self) -> int:
-        """Stamp of the state answered last, ns."""
-        return stamp_to_ns(self._last.header.stamp)
-
     def accelerations(self, a: np.ndarray, stamp: Any) -> None:
         """Tell, where it is asked for, what the next command stands for, shape (n,), rad/s^2."""
         if self._accelerations is None:

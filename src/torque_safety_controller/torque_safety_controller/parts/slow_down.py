@@ -75,8 +75,6 @@ class SlowDown(Part):
             v: velocity, shape (n,), rad/s.
             share: from 0 to 1.
         """
-        if share >= 1.0:
-            return bounds
         lower, upper = bounds
         low, high = self._position_limits
         speed = np.abs(v)

@@ -21,6 +21,9 @@ Integers = NDArray[np.int64]
 AT_START, MOSTLY, ALWAYS = "collision_posture", "most postures", "all postures"
 """Where pairs are near each other that are not kept apart."""
 
+CLEARANCE = 0.025
+"""Distance of pairs that are left out as near each other, m: more than the margin to be kept."""
+
 _MOSTLY = 0.5  # links that are near each other in more than this share of postures are left out
 _POSTURES = 200  # from which it is told
 _WHOLE, _ENDS = (0.0, 1.0), ((0.0, 0.0), (1.0, 1.0))  # shares of a segment
@@ -101,7 +104,6 @@ def build_collision_model(
     q_start: ArrayLike,
     obstacles: Sequence[Shape] = (),
     base_frame: str | None = None,
-    clearance: float = 0.025,
 ) -> CollisionModel:
     """Return the collision model of an arm.
 
@@ -112,9 +114,10 @@ def build_collision_model(
             other there are left out.
         obstacles: that every link is kept away from which can move.
         base_frame: that obstacles are given in, fixed to the base; None: the URDF's root.
-        clearance: pairs that are nearer than this at the start, or in most of some random
-            postures, are left out, m: more than the margin to be kept. Their capsules, not the
-            links, are in each other's way. So are obstacles that a link cannot get away from.
+
+    Pairs that are nearer than `CLEARANCE` at the start, or in most of some random postures, are
+    left out: their capsules, not the links, are in each other's way. So are obstacles that a link
+    cannot get away from.
 
     Raises:
         SettingError: an unknown link; named as the node's parameter.
@@ -140,7 +143,7 @@ def build_collision_model(
     low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
     high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
     postures = np.random.default_rng(0).uniform(low, high, size=(_POSTURES, model.nq))
-    near = _near(model, geometry, clearance, np.vstack([np.asarray(q_start), postures]))
+    near = _near(model, geometry, np.vstack([np.asarray(q_start), postures]))
     share = near[1:].mean(axis=0)
     kept: list[int] = []
     left_out: dict[str, list[str]] = {}
@@ -189,15 +192,13 @@ def _link_pairs(model: pin.Model, joints: Sequence[int]) -> list[tuple[int, int]
     ]
 
 
-def _near(
-    model: pin.Model, geometry: pin.GeometryModel, clearance: float, postures: Array
-) -> NDArray[np.bool_]:
-    """Return which pairs are nearer than `clearance` in each posture, by coal, shape (k, p)."""
+def _near(model: pin.Model, geometry: pin.GeometryModel, postures: Array) -> NDArray[np.bool_]:
+    """Return which pairs are nearer than `CLEARANCE` in each posture, by coal, shape (k, p)."""
     data, found = model.createData(), geometry.createData()
     near = np.zeros((len(postures), len(geometry.collisionPairs)), dtype=bool)
     for row, q in zip(near, postures, strict=True):
         pin.computeDistances(model, data, geometry, found, q)
-        row[:] = [result.min_distance < clearance for result in found.distanceResults]
+        row[:] = [result.min_distance < CLEARANCE for result in found.distanceResults]
     return near
 
 
