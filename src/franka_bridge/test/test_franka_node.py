@@ -79,6 +79,12 @@ def test_states_are_those_of_the_robot_and_it_stands(probe):
     assert probe.ros.reported("franka_node", "robot_mode") == "Move"
 
 
+def test_the_arm_is_held_before_a_controller_is_there(ros, robot):
+    """Also in lockstep, where the node waits for the command of the first state."""
+    probe = Probe(ros, robot, clock="lockstep")
+    assert probe.node._drive.stop.at_rest
+
+
 def test_commands_act_and_the_arm_stops_without_them(probe):
     probe.awaits("stopped")
     begin = probe.q[0]

@@ -141,8 +141,10 @@ class FrankaNode(ArmNode):
         )
         state = arm.read()
         self._drive.start(np.array(state.q), np.array(state.dq), np.array(state.tau_J_d))
+        # At once: without torques the arm floats until a controller is there.
+        arm.write(self._torque(None, False))
         self._commands.restart()
-        self._started_at, self._played, self._fault = time.monotonic(), self._periods, ""
+        self._fault = ""
 
     def _set_clock(self) -> None:
         """Let stamps follow the robot's time from now on."""
