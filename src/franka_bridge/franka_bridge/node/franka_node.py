@@ -38,8 +38,8 @@ Array = NDArray[np.float64]
 _DEADLINE = 0.7
 """Share of a period after which the robot gets its torques without a command."""
 
-_PATIENCE = 5.0
-"""The same in lockstep, with a simulated robot that waits for commands, s."""
+_PATIENCE = 0.4
+"""The same in lockstep, with a simulated robot that waits for commands a little longer, s."""
 
 _TOOL_ERROR = 0.1
 """By how much the masses of the hand may differ without a word, kg."""
