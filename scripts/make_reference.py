@@ -30,7 +30,8 @@ from torque_safety_controller.remote.moveit_parameters import MoveitConfiguratio
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.node.estimator_node import EstimatorConfiguration
 from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table
-from viability_bounds_pkg.ros.topics import SHARED_TOPICS, OfferedService, Topic
+from viability_bounds_pkg.ros import topics
+from viability_bounds_pkg.ros.topics import OfferedService, Topic
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGURATIONS = {
@@ -45,9 +46,10 @@ CONFIGURATIONS = {
     "moveit_node": MoveitConfiguration,
 }
 TABLES = {node: parameter_table(kind) for node, kind in CONFIGURATIONS.items()}
-_ROOMS = controller_topics, bullet_topics, franka_topics
-TOPICS: tuple[Topic, ...] = sum((room.TOPICS for room in _ROOMS), SHARED_TOPICS)
-SERVICES: tuple[OfferedService, ...] = sum((room.SERVICES for room in _ROOMS), ())
+_ROOMS = topics, controller_topics, bullet_topics, franka_topics
+_DECLARED = [each for room in _ROOMS for each in vars(room).values()]
+TOPICS = [each for each in _DECLARED if isinstance(each, Topic)]
+SERVICES = [each for each in _DECLARED if isinstance(each, OfferedService)]
 _HEAD = "<!-- Made by scripts/make_reference.py: change the tables in the code instead. -->\n"
 _TYPES = {
     float: "double",

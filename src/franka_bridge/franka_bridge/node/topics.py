@@ -28,8 +28,6 @@ EXTERNAL_WRENCH_ESTIMATE = Topic(
     (USER,),
     "libfranka's `O_F_ext_hat_K`, in the axes of the robot's base, N and N m",
 )
-TOPICS = (EXTERNAL_TORQUES, EXTERNAL_WRENCH_ESTIMATE)
-
 RECOVER = OfferedService(
     "recover",
     Trigger,
@@ -37,4 +35,3 @@ RECOVER = OfferedService(
     "resets the robot's errors, or connects again, and begins torque control: the arm is held; a "
     "robot that does not know its load is told it first, at rest",
 )
-SERVICES = (RECOVER,)

@@ -47,10 +47,7 @@ RECORDED = Topic(
     "stamp of a state that is recorded; in lockstep the robot begins no period that is more than "
     "20 later",
 )
-TOPICS = (OBSTACLES, EXTERNAL_WRENCH, CLOCK, RECORDED)
-
 RESET = OfferedService(
     "reset", Trigger, _NODE, "puts the robot at its start configuration, at rest"
 )
 PAUSE = OfferedService("pause", SetBool, _NODE, "stops robot time (true) or lets it go on (false)")
-SERVICES = (RESET, PAUSE)

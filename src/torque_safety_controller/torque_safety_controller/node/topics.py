@@ -47,15 +47,6 @@ TARGET_TRAJECTORY = Topic(
     (_NODE,),
     "poses of the end effector over time, in `base_frame`; one transform in each point",
 )
-TARGET_WRENCH = Topic(
-    "target_wrench",
-    WrenchStamped,
-    GOAL_QOS,
-    (USER, "scenario_node"),
-    (_NODE,),
-    "wrench that the hand exerts in `force_directions`, N and N m; axes of the end effector (or"
-    " empty) or of `base_frame`",
-)
 TARGET_JOINT_TRAJECTORY = Topic(
     "target_joint_trajectory",
     JointTrajectory,
@@ -82,6 +73,15 @@ JOG_JOINTS = Topic(
     (_NODE,),
     "`velocity` of some joints, rad/s, valid for 0.25 s; replaces a pose goal",
 )
+TARGET_WRENCH = Topic(
+    "target_wrench",
+    WrenchStamped,
+    GOAL_QOS,
+    (USER, "scenario_node"),
+    (_NODE,),
+    "wrench that the hand exerts in `force_directions`, N and N m; axes of the end effector (or"
+    " empty) or of `base_frame`",
+)
 ROS2_CONTROL_EFFORTS = Topic(
     "<ros2_control_topic>",
     Float64MultiArray,
@@ -107,25 +107,6 @@ CONTROLLER_MODE = Topic(
     ("moveit_node", USER),
     "TRACKING, HOLD, POSITION or STOPPED, at each change",
 )
-GOALS = (
-    TARGET_POSE,
-    TARGET_POSE_SECOND,
-    TARGET_POSTURE,
-    TARGET_TRAJECTORY,
-    TARGET_JOINT_TRAJECTORY,
-    JOG_HAND,
-    JOG_JOINTS,
-    TARGET_WRENCH,
-)
-"""What the arm obeys from one node each."""
-
-TOPICS = (
-    *GOALS,
-    ROS2_CONTROL_EFFORTS,
-    HAND_POSE,
-    CONTROLLER_MODE,
-)
-
 ENABLE_TORQUE = OfferedService(
     "enable_torque",
     SetBool,
@@ -138,4 +119,3 @@ TARE_FT_SENSOR = OfferedService(
     _NODE,
     "sets the sensor's bias to the present measurement; call it with the hand free",
 )
-SERVICES = (ENABLE_TORQUE, TARE_FT_SENSOR)

@@ -221,20 +221,3 @@ DIAGNOSTICS = Topic(
 def state_topic(estimated: bool) -> Topic:
     """Return the topic of the joint states that a node works on: estimated ones, or reported."""
     return ESTIMATED_JOINT_STATES if estimated else JOINT_STATES
-
-
-SHARED_TOPICS = (
-    JOINT_STATES,
-    ESTIMATED_JOINT_STATES,
-    ACCELERATION_LIMITS,
-    JOINT_COMMANDS,
-    COMMANDED_ACCELERATIONS,
-    FT_WRENCH,
-    PAYLOAD,
-    LIMIT_DISTANCES,
-    SLOW_JOINT_STATES,
-    SLOW_ACCELERATION_LIMITS,
-    ROBOT_DESCRIPTION,
-    DIAGNOSTICS,
-)
-"""Topics between nodes of different packages, and those of the bounds node."""
