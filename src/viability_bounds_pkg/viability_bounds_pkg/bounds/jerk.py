@@ -39,22 +39,11 @@ _HALVINGS = 50
 _SLACK = 1e-6
 """Share of the range that reduced braking leaves, as rounding at one limit grows at the other."""
 
-ONE_SIDED_LIMIT = np.dtype(
-    [
-        ("position", np.float64),
-        ("v_max", np.float64),
-        ("dt", np.float64),
-        ("drop", np.float64),
-        ("change", np.float64),
-        ("braking", np.float64),
-        ("low", np.float64),
-        ("high", np.float64),
-        ("margin", np.float64),
-        ("room_tolerance", np.float64),
-        ("speed_tolerance", np.float64),
-    ],
-    align=True,
-)
+_FIELDS = (
+    "position", "v_max", "dt", "drop", "change", "braking", "low", "high", "margin",
+    "room_tolerance", "speed_tolerance"
+)  # fmt: skip
+ONE_SIDED_LIMIT = np.dtype([(name, np.float64) for name in _FIELDS], align=True)
 """One position limit of one joint, as compiled code reads it by name.
 
 - position: of the limit, rad; the room is ``position - q``, for the lower limit ``position + q``.

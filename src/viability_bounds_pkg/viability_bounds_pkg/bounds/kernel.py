@@ -25,27 +25,11 @@ Array = NDArray[np.float64]
 _TINY = float_info.min
 _WITHIN = 1.0 + ROUNDING
 
-ONE_SIDED_LIMIT = np.dtype(
-    [
-        ("position", np.float64),
-        ("dt", np.float64),
-        ("twice_braking", np.float64),
-        ("k", np.float64),
-        ("free", np.float64),
-        ("v_max", np.float64),
-        ("low", np.float64),
-        ("high", np.float64),
-        ("margin", np.float64),
-        ("velocity_error", np.float64),
-        ("tolerance", np.float64),
-        ("rest", np.float64),
-        ("offset", np.float64),
-        ("knee", np.float64),
-        ("twice_full", np.float64),
-        ("full_room", np.float64),
-    ],
-    align=True,
-)
+_FIELDS = (
+    "position", "dt", "twice_braking", "k", "free", "v_max", "low", "high", "margin",
+    "velocity_error", "tolerance", "rest", "offset", "knee", "twice_full", "full_room"
+)  # fmt: skip
+ONE_SIDED_LIMIT = np.dtype([(name, np.float64) for name in _FIELDS], align=True)
 """One position limit of one joint, as compiled code reads it by name.
 
 - position: where a joint comes to rest at the latest, rad; the room is ``position - q``, for the
