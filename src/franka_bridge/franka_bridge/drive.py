@@ -160,9 +160,8 @@ class Drive:
             follows = through and not held
         if not (self._by_law or follows):
             self._start_law(q, v)
-        self.stop.torque_range = tuple(
-            np.clip(each + added, -self._tau_max, self._tau_max) for each in (lowest, highest)
-        )
+        low, high = np.clip([lowest + added, highest + added], -self._tau_max, self._tau_max)
+        self.stop.torque_range = low, high
         if tau is None:
             tau = self.stop.torque(q, v)
         elif self._by_law:
