@@ -140,14 +140,14 @@ def bounds_of_states(
     Raises:
         JointLimitsError: the shapes differ, or do not fit the number of joints.
     """
-    arrays = [np.asarray(each, dtype=np.float64) for each in states]
-    n, first = len(table), arrays[0]
-    shape, size = first.shape, first.size
-    if len(shape) not in (1, 2) or shape[-1] != n or any([a.shape != shape for a in arrays]):
-        shapes = " and ".join(str(each.shape) for each in arrays)
-        allowed = f"all must have shape ({n},) or (batch, {n})"
-        raise JointLimitsError("state", None, f"of shapes {shapes}", allowed)
-    lower, upper, viable = np.empty(size), np.empty(size), np.empty(size, dtype=np.bool_)
+    arrays = [np.asarray(each, np.float64) for each in states]
+    n, shape, size = len(table), arrays[0].shape, arrays[0].size
+    for each in arrays:  # in one line it takes longer
+        if each.shape != shape or len(shape) not in (1, 2) or shape[-1] != n:
+            shapes = " and ".join(str(each.shape) for each in arrays)
+            allowed = f"all must have shape ({n},) or (batch, {n})"
+            raise JointLimitsError("state", None, f"of shapes {shapes}", allowed)
+    lower, upper, viable = np.empty(size), np.empty(size), np.empty(size, np.bool_)
     if len(shape) == 1:  # to reshape takes longer than to find the bounds of one arm
         solve(*arrays, table, lower, upper, viable)
         return AccelerationBounds(lower, upper, viable)
