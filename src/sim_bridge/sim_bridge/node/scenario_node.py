@@ -100,6 +100,11 @@ class ScenarioNode(ArmNode):
         return self.recorder.diagnostics[self.config.robot_node]
 
     @property
+    def reached(self) -> tuple[str, int]:
+        """What it waits for, and how far robot time is, which counts once the scenario began."""
+        return self.awaits, -1 if self._refused is None else self.recorder.stamp
+
+    @property
     def _pauses(self) -> bool:
         """Whether the robot can be reset and paused."""
         return "paused" in self.robot or not self.robot
@@ -278,8 +283,8 @@ def _run(executor: Executor, node: ScenarioNode, signals: Sequence[int], quiet: 
         # calls for one each.
         executor.spin_until_future_complete(node.ended, timeout_sec=0.1)
         now = time.monotonic()
-        if (node.recorder.stamp, node.awaits) != seen:
-            seen, moved_at = (node.recorder.stamp, node.awaits), now
+        if node.reached != seen:
+            seen, moved_at = node.reached, now
         elif now - moved_at > node.config.ready_timeout:
             raise TimeoutError(
                 f"nothing has moved for {node.config.ready_timeout:g} s ({node.awaits})"

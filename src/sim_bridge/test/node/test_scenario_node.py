@@ -50,6 +50,25 @@ def test_it_gives_up_when_nobody_answers(capfd, tmp_path):
     assert line.startswith("error: nothing has moved for 0.3 s (getting ready: there is no paused")
 
 
+def test_states_alone_are_no_progress_towards_the_start(ros, tmp_path):
+    """A robot that cannot pause goes on while a node does not start."""
+    arguments(tmp_path)
+    values = read_config("panda", "scenario_node")
+    node = ros.start(
+        scenario_node.ScenarioNode, values | {"scenario": str(tmp_path / "scenario.yaml")}
+    )
+    states, rest = ros.talk(JointState, "joint_states"), np.zeros(7)
+    reached = set()
+    for stamp in (10, 20):  # ns
+        state = joint_state(values["joints"], stamp, q=rest, v=rest)
+        ros.wait_until(
+            lambda expected=stamp: node.recorder.stamp == expected and node.awaits,
+            each=lambda sent=state: states.publish(sent),
+        )
+        reached.add(node.reached[1])
+    assert len(reached) == 1
+
+
 def test_told_to_stop_it_judges_nothing(tmp_path):
     executable = f"{get_package_prefix('sim_bridge')}/lib/sim_bridge/scenario_node"
     words = [executable, "--out", str(tmp_path / "out"), *arguments(tmp_path)]
