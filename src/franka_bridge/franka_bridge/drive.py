@@ -36,7 +36,7 @@ _WITHIN = 1.0 - 1e-6
 """Share of steps of the torque that is used: states have torques with seven digits."""
 
 _LEAST_RANGE = 0.1
-"""Of the torques that may be sent, in steps of the torque, where some were lost."""
+"""Of the torques that the law counts with, in steps of the torque, where some came late."""
 
 
 class Drive:
@@ -150,7 +150,7 @@ class Drive:
         self._applied = applied
         highest = np.minimum(np.minimum(sent, base) + self._step, self._tau_max)
         lowest = np.maximum(np.maximum(sent, base) - self._step, -self._tau_max)
-        lowest = np.minimum(lowest, highest - _LEAST_RANGE * self._step)
+        lowest = np.minimum(lowest, highest)
         tau, follows = None, False
         if command is not None:
             tau = np.clip(self.asked(q, command), -self._tau_max, self._tau_max)
@@ -160,7 +160,8 @@ class Drive:
             follows = through and not held
         if not (self._by_law or follows):
             self._start_law(q, v)
-        low, high = np.clip([lowest + added, highest + added], -self._tau_max, self._tau_max)
+        wide = np.minimum(lowest, highest - _LEAST_RANGE * self._step)
+        low, high = np.clip([wide + added, highest + added], -self._tau_max, self._tau_max)
         self.stop.torque_range = low, high
         if tau is None:
             tau = self.stop.torque(q, v)
