@@ -53,7 +53,7 @@ class Drive:
     Attributes:
         stop: the stop law.
         payload: what the arm carries; `told` is what the robot knows of it.
-        clipped: periods in which limits of torque or torque rate let no command through.
+        clipped: periods whose command was beyond the limits of torque or torque rate.
     """
 
     def __init__(
